@@ -1,0 +1,16 @@
+"""Errors meant for users: one sentence that says what was given, what is allowed, what to do."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class UserError(ValueError):
+    """A mistake in the input. Entry points print its one sentence and exit with code 2."""
+
+
+def did_you_mean(word: str, options: Iterable[str]) -> str:
+    """A sentence fragment listing `options`, led by the closest one to `word` if any is close."""
+    options = sorted(options)
+    close = difflib.get_close_matches(word, options, n=1, cutoff=0.5)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}Allowed: {', '.join(options)}."
