@@ -1,0 +1,235 @@
+"""Configurations: frozen dataclasses that hold numbers only, and the presets built from them."""
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+from .errors import UserError, did_you_mean
+
+WAN_LATENT_MEAN = (
+    -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,
+    0.4134, -0.0715, 0.5517, -0.3632, -0.1922, -0.9497, 0.2503, -0.2921,
+)  # fmt: skip
+WAN_LATENT_STD = (
+    2.8184, 1.4541, 2.3275, 2.6558, 1.2196, 1.7708, 2.6052, 2.0743,
+    3.2687, 2.1526, 2.8652, 1.5579, 1.6382, 1.1253, 2.8251, 1.9160,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Camera-conditioned VGGT: patch encoder, alternating attention, camera MLP."""
+
+    patch: int = 14
+    width: int = 1024
+    heads: int = 16
+    depth: int = 24  # pairs of one frame block and one global block
+    dino_depth: int = 24  # 0: a linear patch embedding of RGB and rays instead of DINOv2
+    position_grid: int = 37  # side of DINOv2's learned position table
+    registers: int = 4
+    long_side: int | None = 518  # images are resized to this inside the encoder; None: used as they are
+    relative_cameras: bool = False  # projective relative-camera attention in global blocks
+
+
+@dataclass(frozen=True)
+class RendererConfig:
+    """Ray-map encoder, ray-scene blocks and RGB head (LagerNVS)."""
+
+    patch: int = 8
+    width: int = 768
+    heads: int = 12
+    depth: int = 12
+    registers: int = 4
+    attention: Literal["bidirectional", "cross", "full"] = "bidirectional"
+    refinement: Literal["per_view", "shared"] = "per_view"  # whose scene tokens the rays refine
+    relative_cameras: bool = False
+    chunk: int = 8  # views processed at a time
+
+
+@dataclass(frozen=True)
+class VAEConfig:
+    """Wan2.1 causal video VAE: 8 x 8 in space, 4 in time with the first frame alone."""
+
+    base: int = 96
+    latent: int = 16
+    multipliers: tuple[int, ...] = (1, 2, 4, 4)
+    res_blocks: int = 2
+    temporal: tuple[bool, ...] = (False, True, True)  # which down-samplings also halve time
+    latent_mean: tuple[float, ...] = WAN_LATENT_MEAN
+    latent_std: tuple[float, ...] = WAN_LATENT_STD
+
+
+@dataclass(frozen=True)
+class DiTConfig:
+    """Wan2.1 diffusion transformer."""
+
+    width: int = 5120
+    heads: int = 40
+    depth: int = 40
+    ffn: int = 13824
+    in_channels: int = 36  # noisy latent 16, mask 4, condition latent 16
+    out_channels: int = 16
+    patch: int = 2  # in space; time is never patched
+    freq_dim: int = 256
+    text_dim: int = 4096
+    text_len: int = 512  # 0: no cross-attention at all
+    clip_dim: int = 1280  # 0: no image branch (T2V)
+    clip_rows: int = 257
+
+
+@dataclass(frozen=True)
+class FusionConfig:
+    geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
+    context_rope: Literal["none", "shared"] = "none"  # temporal rotation on context slots
+    target_appearance: Literal["zeros", "grey"] = "zeros"  # condition latents of target slots
+
+
+@dataclass(frozen=True)
+class FlowConfig:
+    shift: float = 5.0
+    weighting: Literal["bump", "uniform"] = "bump"
+    sigma_sampling: Literal["uniform_index", "logit_normal"] = "uniform_index"
+    photometric: float = 0.1  # lambda of the joint loss
+
+
+@dataclass(frozen=True)
+class LoraConfig:
+    dit_rank: int = 32
+    dit_match: str = r"blocks/.*(self_attn|cross_attn)/(q|k|v|o)$|blocks/.*ffn/(fc1|fc2)$"
+    recon_rank: int = 8
+    recon_match: str = (
+        r"(frame_blocks|global_blocks|blocks|last_block|camera_mlp)/|connector$|ray_embed$|rgb_head/linear$"
+    )
+
+
+@dataclass(frozen=True)
+class RoGeConfig:
+    """Everything that fixes the shapes and the maths of one model."""
+
+    name: str = "paper"
+    height: int = 192  # of the generated video
+    width: int = 336
+    recon_height: int = 288  # of the images and rays of the reconstruction branch
+    recon_width: int = 504
+    frames: int = 81  # per window, 1 + 4k
+    max_context: int = 9
+    scale_rule: Literal["lagernvs", "paper"] = "lagernvs"
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    renderer: RendererConfig = field(default_factory=RendererConfig)
+    vae: VAEConfig = field(default_factory=VAEConfig)
+    dit: DiTConfig = field(default_factory=DiTConfig)
+    fusion: FusionConfig = field(default_factory=FusionConfig)
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    lora: LoraConfig = field(default_factory=LoraConfig)
+
+    def __post_init__(self):
+        pixels = 8 * self.dit.patch
+        if self.height % pixels or self.width % pixels:
+            raise UserError(
+                f"Size {self.height}x{self.width} does not fit: height and width must be multiples of "
+                f"{pixels}; try {_nearest(self.height, pixels)}x{_nearest(self.width, pixels)}."
+            )
+        p = self.renderer.patch
+        if self.recon_height % p or self.recon_width % p:
+            raise UserError(
+                f"Reconstruction size {self.recon_height}x{self.recon_width} does not fit: both must be "
+                f"multiples of {p}; try {_nearest(self.recon_height, p)}x{_nearest(self.recon_width, p)}."
+            )
+        if self.frames < 1 or self.frames % 4 != 1:
+            k = max(self.frames - 1, 0) // 4
+            raise UserError(
+                f"{self.frames} frames cannot form latent slots: need 1 + 4k, e.g. {1 + 4 * k} or {5 + 4 * k}."
+            )
+
+    @property
+    def latent_size(self) -> tuple[int, int]:
+        return self.height // 8, self.width // 8
+
+    def slots(self, contexts: int) -> int:
+        """Latent slots of a window: one per context, one for the first target, one per four more."""
+        return contexts + 1 + (self.frames - 1) // 4
+
+
+def _nearest(size: int, multiple: int) -> int:
+    return max(multiple, round(size / multiple) * multiple)
+
+
+def _tiny() -> RoGeConfig:
+    return RoGeConfig(
+        name="tiny",
+        height=32,
+        width=48,
+        recon_height=32,
+        recon_width=48,
+        frames=5,
+        encoder=EncoderConfig(
+            patch=8, width=32, heads=2, depth=1, dino_depth=0, long_side=None, relative_cameras=True
+        ),
+        renderer=RendererConfig(width=32, heads=2, depth=2, relative_cameras=True, chunk=4),
+        vae=VAEConfig(base=8),
+        dit=DiTConfig(
+            width=64, heads=2, depth=2, ffn=128, freq_dim=32, text_dim=16, text_len=4, clip_dim=0
+        ),
+        fusion=FusionConfig(geometry_channels=16),
+        lora=LoraConfig(dit_rank=4, recon_rank=2),
+    )
+
+
+def _mini() -> RoGeConfig:
+    return RoGeConfig(
+        name="mini",
+        height=64,
+        width=112,
+        recon_height=64,
+        recon_width=112,
+        frames=17,
+        max_context=6,
+        encoder=EncoderConfig(
+            patch=8, width=256, heads=4, depth=3, dino_depth=0, long_side=None, relative_cameras=True
+        ),
+        renderer=RendererConfig(
+            width=256, heads=4, depth=6, attention="cross", relative_cameras=True, chunk=32
+        ),
+        vae=VAEConfig(base=16),
+        dit=DiTConfig(
+            width=256, heads=4, depth=8, ffn=1024, freq_dim=256, text_dim=64, text_len=0, clip_dim=0
+        ),
+        fusion=FusionConfig(geometry_channels=128),
+        lora=LoraConfig(dit_rank=8, recon_rank=8),
+    )
+
+
+def _wan_1_3b() -> RoGeConfig:
+    return RoGeConfig(
+        name="wan1.3b",
+        dit=DiTConfig(width=1536, heads=12, depth=30, ffn=8960, clip_dim=0),
+    )
+
+
+PRESETS = {"tiny": _tiny, "mini": _mini, "wan1.3b": _wan_1_3b, "paper": RoGeConfig}
+
+
+def preset(name: str) -> RoGeConfig:
+    """The named configuration: tiny, mini, wan1.3b or paper."""
+    if name not in PRESETS:
+        raise UserError(f"Unknown preset '{name}': {did_you_mean(name, PRESETS)}")
+    return PRESETS[name]()
+
+
+def to_dict(config) -> dict:
+    return dataclasses.asdict(config)
+
+
+def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
+    """The inverse of `to_dict`; unknown or missing fields are named in one `UserError`."""
+    known = {f.name: f for f in dataclasses.fields(cls)}
+    unknown = sorted(set(values) - set(known))
+    if unknown:
+        raise UserError(f"{source}: unknown field '{unknown[0]}': {did_you_mean(unknown[0], known)}")
+    built = {}
+    for name, value in values.items():
+        default = known[name].default_factory
+        if dataclasses.is_dataclass(default):
+            value = from_dict(value, default, source=f"{source}.{name}")
+        built[name] = tuple(value) if isinstance(value, list) else value
+    return cls(**built)

@@ -1,0 +1,35 @@
+"""Scaled dot-product attention: the fused kernel on GPU, a form that is fast on CPU elsewhere."""
+
+import jax
+import jax.numpy as jnp
+
+
+def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) -> jax.Array:
+    """softmax(q k^T / sqrt(e)) v for q [.., l, k, e] and k, v [.., s, k, e]; no mask. Returns float32.
+
+    `dtype` is that of the matrix products' inputs; with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
+    no memory for the l x s scores. On CPU the scale goes into q, the row maximum is not differentiated (its
+    gradient is zero) and the division comes after the product with v: fewer passes over the scores.
+    """
+    scale = q.shape[-1] ** -0.5
+    if jax.default_backend() == "gpu" and dtype == jnp.bfloat16:
+        lead = q.shape[:-3]
+        q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
+        y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn")
+        return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
+    q = jnp.swapaxes(q * scale, -3, -2).astype(dtype)
+    k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (k, v))
+    s = jnp.einsum("...qe,...se->...qs", q, k, preferred_element_type=jnp.float32)
+    s = jnp.exp(s - jax.lax.stop_gradient(s.max(-1, keepdims=True)))
+    y = jnp.einsum("...qs,...se->...qe", s.astype(dtype), v, preferred_element_type=jnp.float32)
+    return jnp.swapaxes(y / s.sum(-1, keepdims=True), -3, -2)
+
+
+def split_heads(x: jax.Array, heads: int) -> jax.Array:
+    """[.., l, d] -> [.., l, heads, d / heads]."""
+    return x.reshape(*x.shape[:-1], heads, x.shape[-1] // heads)
+
+
+def merge_heads(x: jax.Array) -> jax.Array:
+    """[.., l, heads, e] -> [.., l, heads * e]."""
+    return x.reshape(*x.shape[:-2], -1)

@@ -1,0 +1,99 @@
+"""Leaf layers: pairs of `x_specs(sizes)` and `x(p, inputs)`. Channels last, leaf names as in Flax."""
+
+import jax
+import jax.numpy as jnp
+
+from .params import Spec, Tree, fan_in, ones, zeros
+
+
+def lift(v: jax.Array, ndim: int) -> jax.Array:
+    """A vector [d] as [1, .., 1, d] (implicit rank promotion is an error in this code base)."""
+    return v.reshape((1,) * (ndim - 1) + v.shape)
+
+
+def matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
+    """x [.., d_in] @ kernel [d_in, d_out], inputs in the kernel's dtype if that is 16 bit, accumulated in float32."""
+    if kernel.dtype == jnp.float32:
+        return x.astype(jnp.float32) @ kernel
+    return jnp.einsum(
+        "...i,io->...o", x.astype(kernel.dtype), kernel, preferred_element_type=jnp.float32
+    )
+
+
+def linear_specs(d_in: int, d_out: int, axes=("embed", "mlp"), *, bias=True, init=None) -> Tree:
+    specs = {"kernel": Spec((d_in, d_out), axes, init or fan_in())}
+    return specs | ({"bias": Spec((d_out,), axes[1:], zeros)} if bias else {})
+
+
+def linear(p: Tree, x: jax.Array) -> jax.Array:
+    """x [.., d_in] -> float32 [.., d_out]; adds the low-rank branch if `p` carries one (see `core.lora`)."""
+    y = matmul(x, p["kernel"])
+    if "lora_a" in p:
+        y = y + matmul(matmul(x, p["lora_a"]), p["lora_b"])
+    return y + lift(p["bias"], y.ndim).astype(y.dtype) if "bias" in p else y
+
+
+def norm_specs(d: int, *, bias=True) -> Tree:
+    return {"scale": Spec((d,), (None,), ones)} | ({"bias": Spec((d,), (None,), zeros)} if bias else {})
+
+
+def layer_norm(p: Tree, x: jax.Array, *, eps: float) -> jax.Array:
+    """LayerNorm over the last axis in float32; `p` may lack `bias`, or be empty (no affine part)."""
+    x = x.astype(jnp.float32)
+    mean = x.mean(-1, keepdims=True)
+    x = x - mean
+    y = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + eps)
+    if "scale" in p:
+        y = y * lift(p["scale"], y.ndim).astype(jnp.float32)
+    return y + lift(p["bias"], y.ndim).astype(jnp.float32) if "bias" in p else y
+
+
+def rms_norm(p: Tree, x: jax.Array, *, eps: float) -> jax.Array:
+    """x / sqrt(mean x^2 + eps) * scale over the last axis, in float32."""
+    x = x.astype(jnp.float32)
+    y = x * jax.lax.rsqrt(jnp.square(x).mean(-1, keepdims=True) + eps)
+    return y * lift(p["scale"], y.ndim).astype(jnp.float32)
+
+
+def gelu(x: jax.Array, *, exact: bool) -> jax.Array:
+    return jax.nn.gelu(x, approximate=not exact)
+
+
+def mlp_specs(d: int, hidden: int, *, bias=True, init_out=None) -> Tree:
+    return {
+        "fc1": linear_specs(d, hidden, ("embed", "mlp"), bias=bias),
+        "fc2": linear_specs(hidden, d, ("mlp", "embed"), bias=bias, init=init_out),
+    }
+
+
+def mlp(p: Tree, x: jax.Array, *, exact: bool) -> jax.Array:
+    """Two linears with a GELU between: the erf form if `exact`, else the tanh form."""
+    return linear(p["fc2"], gelu(linear(p["fc1"], x), exact=exact))
+
+
+def patchify(x: jax.Array, patch: int) -> jax.Array:
+    """Images [.., h, w, c] to flattened patches [.., h/p * w/p, p*p*c], (row, column, channel) order."""
+    *lead, h, w, c = x.shape
+    x = x.reshape(*lead, h // patch, patch, w // patch, patch, c)
+    x = jnp.swapaxes(x, -4, -3)
+    return x.reshape(*lead, (h // patch) * (w // patch), patch * patch * c)
+
+
+def unpatchify(x: jax.Array, grid: tuple[int, int], patch: int) -> jax.Array:
+    """The inverse of `patchify`: [.., gh*gw, p*p*c] to [.., gh*p, gw*p, c]."""
+    *lead, _, f = x.shape
+    gh, gw = grid
+    x = x.reshape(*lead, gh, gw, patch, patch, f // patch**2)
+    return jnp.swapaxes(x, -4, -3).reshape(*lead, gh * patch, gw * patch, f // patch**2)
+
+
+def patch_conv_specs(patch: int, c_in: int, d: int, *, bias=True, init=None) -> Tree:
+    """A convolution whose stride equals its kernel, kept in convolution layout [p, p, c_in, d]."""
+    specs = {"kernel": Spec((patch, patch, c_in, d), (None, None, None, "embed"), init or fan_in())}
+    return specs | ({"bias": Spec((d,), ("embed",), zeros)} if bias else {})
+
+
+def patch_conv(p: Tree, x: jax.Array) -> jax.Array:
+    """Images [.., h, w, c] -> tokens [.., h/p * w/p, d], as one matrix product over patches."""
+    patch, d = p["kernel"].shape[0], p["kernel"].shape[-1]
+    return linear(p | {"kernel": p["kernel"].reshape(-1, d)}, patchify(x, patch))

@@ -1,0 +1,137 @@
+"""Parameters as nested dicts of arrays, declared once as `Spec`s.
+
+A *spec tree* has a `Spec` at every leaf. Initial values, abstract shapes, shardings, checkpoint checks and weight
+conversion are all derived from it, so a leaf's shape is written down in exactly one place.
+"""
+
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import UserError
+
+Tree = dict[str, Any]
+Initialiser = Callable[[jax.Array, tuple[int, ...], Any], jax.Array]
+
+
+def fan_in(scale: float = 1.0) -> Initialiser:
+    """Normal with standard deviation scale / sqrt(product of all axes but the last)."""
+
+    def init(key, shape, dtype):
+        return scale * jax.random.normal(key, shape, dtype) / np.sqrt(np.prod(shape[:-1]))
+
+    return init
+
+
+def normal(std: float) -> Initialiser:
+    return lambda key, shape, dtype: std * jax.random.normal(key, shape, dtype)
+
+
+def constant(value: float) -> Initialiser:
+    return lambda key, shape, dtype: jnp.full(shape, value, dtype)
+
+
+def zeros(key, shape, dtype):
+    return jnp.zeros(shape, dtype)
+
+
+def ones(key, shape, dtype):
+    return jnp.ones(shape, dtype)
+
+
+class Spec(NamedTuple):
+    """One leaf: shape, a logical axis name per dimension (None: never sharded), initialiser, dtype."""
+
+    shape: tuple[int, ...]
+    axes: tuple[str | None, ...]
+    init: Initialiser = fan_in()
+    dtype: Any = jnp.float32
+
+
+def is_spec(x) -> bool:
+    return isinstance(x, Spec)
+
+
+def map_specs(f: Callable[[Spec], Any], specs):
+    return jax.tree.map(f, specs, is_leaf=is_spec)
+
+
+def flatten(tree, prefix: str = "") -> dict[str, Any]:
+    """Nested dicts to {"a/b/c": leaf}, in sorted order."""
+    if not isinstance(tree, Mapping):
+        return {prefix: tree}
+    flat: dict[str, Any] = {}
+    for name in sorted(tree):
+        flat |= flatten(tree[name], f"{prefix}/{name}" if prefix else name)
+    return flat
+
+
+def unflatten(flat: Mapping[str, Any]) -> Tree:
+    tree: Tree = {}
+    for path, leaf in flat.items():
+        *parents, name = path.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[name] = leaf
+    return tree
+
+
+def init(key: jax.Array, specs) -> Tree:
+    """Initial values. A leaf's key depends on its path alone, so adding a leaf changes no other."""
+
+    def leaf(path: str, spec: Spec):
+        return spec.init(jax.random.fold_in(key, zlib.crc32(path.encode())), spec.shape, spec.dtype)
+
+    return unflatten({path: leaf(path, spec) for path, spec in flatten(specs).items()})
+
+
+def abstract(specs) -> Tree:
+    """The same tree as `jax.ShapeDtypeStruct`s: nothing is allocated."""
+    return map_specs(lambda s: jax.ShapeDtypeStruct(s.shape, s.dtype), specs)
+
+
+def count(tree) -> int:
+    """Number of parameters of a tree of specs or arrays."""
+    return sum(int(np.prod(leaf.shape)) for leaf in flatten(tree).values())
+
+
+def stack(specs, n: int):
+    """Specs of `n` equal blocks, stacked along a new leading axis for `lax.scan`."""
+
+    def leaf(s: Spec) -> Spec:
+        def stacked(key, shape, dtype):
+            return jax.vmap(lambda k: s.init(k, s.shape, dtype))(jax.random.split(key, n))
+
+        return Spec((n, *s.shape), ("layers", *s.axes), stacked, s.dtype)
+
+    return map_specs(leaf, specs)
+
+
+def cast(tree, dtype) -> Tree:
+    """Floating leaves of `tree` in `dtype`."""
+    return jax.tree.map(
+        lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+    )
+
+
+def check(params, specs, *, source: str = "parameters") -> None:
+    """Raise one `UserError` that lists every missing, unexpected or misshapen leaf of `params`."""
+    have, want = flatten(params), flatten(specs)
+    faults = [f"missing {path} {want[path].shape}" for path in want if path not in have]
+    faults += [f"unexpected {path} {have[path].shape}" for path in have if path not in want]
+    faults += [
+        f"{path} has shape {tuple(have[path].shape)}, expected {want[path].shape}"
+        for path in want
+        if path in have and tuple(have[path].shape) != tuple(want[path].shape)
+    ]
+    if faults:
+        shown = "; ".join(faults[:20]) + (f"; and {len(faults) - 20} more" if len(faults) > 20 else "")
+        raise UserError(
+            f"{source} does not fit this model ({len(faults)} mismatches): {shown}. "
+            "Use the checkpoint's own config, or convert it for this preset."
+        )
