@@ -25,14 +25,18 @@ def photo_pair(seed=0, h=48, w=56, n=None):
 def test_psnr_of_a_constant_offset_is_closed_form():
     truth = np.full((8, 9, 3), 0.25)
     for offset in (0.5, 0.1, 1e-3):
-        np.testing.assert_allclose(im.psnr(truth + offset, truth), -20 * np.log10(offset), rtol=1e-12)
+        np.testing.assert_allclose(
+            im.psnr(truth + offset, truth), -20 * np.log10(offset), rtol=1e-12
+        )
 
 
 def test_psnr_equals_skimage_clips_and_caps():
     from skimage.metrics import peak_signal_noise_ratio
 
     a, b = photo_pair()
-    np.testing.assert_allclose(im.psnr(a, b), peak_signal_noise_ratio(b, a, data_range=1.0), rtol=1e-12)
+    np.testing.assert_allclose(
+        im.psnr(a, b), peak_signal_noise_ratio(b, a, data_range=1.0), rtol=1e-12
+    )
     assert im.psnr(b, b) == im.CAP_DB and im.psnr(b, b, cap=60.0) == 60.0
     np.testing.assert_allclose(im.psnr(np.full_like(b, 7.0), np.ones_like(b)), im.CAP_DB)
 
@@ -41,7 +45,9 @@ def test_psnr_is_averaged_in_decibels():
     truth = np.zeros((2, 12, 12, 3))
     frames = np.stack([truth[0] + 10 ** (-20 / 20), truth[1] + 10 ** (-40 / 20)])
     result = im.image_metrics(frames, truth)
-    np.testing.assert_allclose(result["psnr"], 30.0, rtol=1e-12)  # 22.97 dB if the errors were averaged
+    np.testing.assert_allclose(
+        result["psnr"], 30.0, rtol=1e-12
+    )  # 22.97 dB if the errors were averaged
     assert result["capped"] == 0 and im.image_metrics(truth, truth)["capped"] == 2
 
 
@@ -51,7 +57,13 @@ def test_ssim_equals_skimage(seed):
 
     a, b = photo_pair(seed)
     expected = structural_similarity(
-        a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0, channel_axis=2
+        a,
+        b,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+        channel_axis=2,
     )
     np.testing.assert_allclose(im.ssim(a, b), expected, rtol=0, atol=1e-7)
 
@@ -64,7 +76,9 @@ def test_ssim_zero_pad_equals_scipy():
     taps /= taps.sum()
 
     def blur(x):
-        return correlate1d(correlate1d(x, taps, axis=0, mode="constant"), taps, axis=1, mode="constant")
+        return correlate1d(
+            correlate1d(x, taps, axis=0, mode="constant"), taps, axis=1, mode="constant"
+        )
 
     ma, mb = blur(a), blur(b)
     va, vb, cov = blur(a * a) - ma**2, blur(b * b) - mb**2, blur(a * b) - ma * mb
@@ -107,7 +121,9 @@ def test_ssim_of_a_bright_flat_image_survives_float32():
     a = b + 1e-3 * rng.standard_normal(b.shape)
     a, b = a.astype(np.float32), b.astype(np.float32)
     # uncentred float32 variances would be off by about 6e-8 / 9e-4
-    np.testing.assert_allclose(im.ssim(jnp.asarray(a), jnp.asarray(b)), im.ssim(a, b), rtol=0, atol=3e-6)
+    np.testing.assert_allclose(
+        im.ssim(jnp.asarray(a), jnp.asarray(b)), im.ssim(a, b), rtol=0, atol=3e-6
+    )
 
 
 def test_bfloat16_images_are_compared_in_float32():
@@ -135,18 +151,26 @@ def test_sharpness_ratio_scales_with_contrast_and_is_one_for_flat_images():
     rng = np.random.default_rng(1)
     truth = rng.random((40, 40, 3))
     half = 0.5 + 0.5 * (truth - 0.5)
-    np.testing.assert_allclose(im.sharpness_ratio(half, truth), 0.5, rtol=1e-4)  # rounding energy: 1e-5
+    np.testing.assert_allclose(
+        im.sharpness_ratio(half, truth), 0.5, rtol=1e-4
+    )  # rounding energy: 1e-5
     flat = np.full((20, 20, 3), 0.3)
     assert im.sharpness_ratio(flat, flat + 0.4) == 1.0
     # only rounding energy is left in the flat image
     energy = im.QUANTISATION / (im._high_pass_energy(np, im._luma(np, truth)) + im.QUANTISATION)
-    np.testing.assert_allclose(im.sharpness_ratio(np.full_like(truth, 0.5), truth), np.sqrt(energy), rtol=1e-9)
+    np.testing.assert_allclose(
+        im.sharpness_ratio(np.full_like(truth, 0.5), truth), np.sqrt(energy), rtol=1e-9
+    )
 
 
 def test_gradient_psnr_is_closed_form_on_a_ramp_and_ignores_exposure():
-    truth = np.broadcast_to(np.linspace(0.2, 0.6, 41)[None, :, None], (30, 41, 3))  # slope 0.01 in x, 0 in y
+    truth = np.broadcast_to(
+        np.linspace(0.2, 0.6, 41)[None, :, None], (30, 41, 3)
+    )  # slope 0.01 in x, 0 in y
     flat = np.full(truth.shape, 0.5)
-    np.testing.assert_allclose(im.gradient_psnr(flat, truth), -10 * np.log10(0.01**2 / 2), rtol=1e-9)
+    np.testing.assert_allclose(
+        im.gradient_psnr(flat, truth), -10 * np.log10(0.01**2 / 2), rtol=1e-9
+    )
     # an offset changes PSNR (14 dB) but leaves no gradient but rounding
     assert im.gradient_psnr(truth + 0.2, truth) == im.CAP_DB
     np.testing.assert_allclose(im.psnr(truth + 0.2, truth), -20 * np.log10(0.2), rtol=1e-9)
@@ -167,7 +191,9 @@ def test_gmsd_equals_a_plain_convolution_and_grows_with_blur():
 
     ma, mb = magnitude(a), magnitude(b)
     c = 170 / 255**2
-    np.testing.assert_allclose(im.gmsd(a, b), np.std((2 * ma * mb + c) / (ma**2 + mb**2 + c)), rtol=1e-10)
+    np.testing.assert_allclose(
+        im.gmsd(a, b), np.std((2 * ma * mb + c) / (ma**2 + mb**2 + c)), rtol=1e-10
+    )
     assert im.gmsd(b, b) == 0.0
     scores = [im.gmsd(gaussian_filter(b, (s, s, 0)), b) for s in (0.5, 1.0, 2.0)]
     assert scores[0] < scores[1] < scores[2]

@@ -18,7 +18,9 @@ from roge_jax.errors import UserError
 CAP_DB = 100.0  # identical images have infinite PSNR; means need a number
 WINDOW, SIGMA = 11, 1.5  # Wang et al. 2004
 LUMA = (0.299, 0.587, 0.114)  # Rec. 601
-QUANTISATION = (1.0 / 255.0) ** 2 / 12.0  # energy of 8-bit rounding: below it, detail is not measurable
+QUANTISATION = (
+    1.0 / 255.0
+) ** 2 / 12.0  # energy of 8-bit rounding: below it, detail is not measurable
 GMSD_C = 170.0 / 255.0**2  # Xue et al. 2014, moved from [0, 255] to [0, 1]
 
 Array = Any  # np.ndarray or jax.Array; the result is of the same kind as the input
@@ -30,7 +32,9 @@ def psnr(image: Array, reference: Array, *, cap: float = CAP_DB) -> Array:
     Values above `cap` dB (identical images) are returned as `cap`.
     """
     xp, image, reference = _pair("psnr", image, reference)
-    error = xp.mean((xp.clip(image, 0.0, 1.0) - xp.clip(reference, 0.0, 1.0)) ** 2, axis=(-3, -2, -1))
+    error = xp.mean(
+        (xp.clip(image, 0.0, 1.0) - xp.clip(reference, 0.0, 1.0)) ** 2, axis=(-3, -2, -1)
+    )
     return _decibel(xp, error, cap)
 
 
@@ -149,7 +153,9 @@ def image_metrics(
         raise UserError(f"image_metrics takes frames [n, h, w, 3] with n >= 1, not {images.shape}.")
     unknown = [name for name in names if name not in IMAGE_METRICS]
     if unknown:
-        raise UserError(f"Unknown image metric {unknown[0]!r}; allowed: {', '.join(IMAGE_METRICS)}.")
+        raise UserError(
+            f"Unknown image metric {unknown[0]!r}; allowed: {', '.join(IMAGE_METRICS)}."
+        )
     result = {name: float(np.mean(IMAGE_METRICS[name](images, references))) for name in names}
     result["capped"] = int(np.sum(psnr(images, references) >= CAP_DB))
     return result
@@ -165,15 +171,23 @@ def _pair(name: str, image: Array, reference: Array) -> tuple[ModuleType, Array,
         )
     for x in (image, reference):
         if not xp.issubdtype(x.dtype, xp.floating):
-            raise UserError(f"{name} takes floats in [0, 1], not {x.dtype}; divide 8-bit images by 255.")
+            raise UserError(
+                f"{name} takes floats in [0, 1], not {x.dtype}; divide 8-bit images by 255."
+            )
     # bfloat16 cannot hold the variances of SSIM
-    dtype = np.float64 if xp is np else jnp.promote_types(jnp.float32, jnp.result_type(image, reference))
+    dtype = (
+        np.float64
+        if xp is np
+        else jnp.promote_types(jnp.float32, jnp.result_type(image, reference))
+    )
     return xp, image.astype(dtype), reference.astype(dtype)
 
 
 def _need_side(name: str, image: Array, side: int) -> None:
     if min(image.shape[-3:-1]) < side:
-        raise UserError(f"{name} needs images of at least {side} x {side} pixels, not {image.shape[-3:-1]}.")
+        raise UserError(
+            f"{name} needs images of at least {side} x {side} pixels, not {image.shape[-3:-1]}."
+        )
 
 
 def _decibel(xp: ModuleType, error: Array, cap: float) -> Array:
