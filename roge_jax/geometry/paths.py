@@ -1,0 +1,246 @@
+"""Camera paths: smooth interpolation of key cameras, and path files (docs/cameras.md)."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.errors import UserError, did_you_mean
+from roge_jax.geometry.cameras import (
+    CONVENTIONS,
+    Cameras,
+    crop_resize_K,
+    invert,
+    opencv_to_opengl,
+    to_host,
+    to_opencv,
+    validate,
+)
+
+
+def interpolate(
+    keys: Cameras, s: np.ndarray, *, times: np.ndarray | None = None, unit: float | None = None
+) -> Cameras:
+    """A smooth path through key cameras [k], taken at progress s [f], 0 the first and 1 the last.
+
+    Positions follow a cubic spline, orientations a spline with continuous angular velocity (scipy's
+    RotationSpline), K is interpolated linearly between keys. Without `times` the speed is constant,
+    counting one radian of turning as much as `unit` of travel (default: the mean distance between
+    keys); with `times` [k], increasing, progress is time. The ends are exact.
+    """
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    keys = to_host(keys)
+    if times is None:
+        keys = keys[_distinct(keys)]
+    if len(keys) == 1:
+        return Cameras(np.repeat(keys.K, len(s), 0), np.repeat(keys.c2w, len(s), 0))
+    travel = np.linalg.norm(np.diff(keys.centres, axis=0), axis=-1)
+    unit = unit or travel.mean() or 1.0
+    turns = Rotation.from_matrix(keys.c2w[:, :3, :3])
+    if times is None:
+        # Centripetal knots: a cubic through them does not loop where keys are unevenly spaced.
+        effort = travel / unit + (turns[:-1].inv() * turns[1:]).magnitude()
+        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(effort))])
+    else:
+        knots = np.asarray(times, np.float64)
+    positions = CubicSpline(knots, keys.centres, bc_type="natural")
+    orientations = RotationSpline(knots, turns)
+    u = knots[0] + s * (knots[-1] - knots[0])
+    if times is None:
+        fine = np.linspace(knots[0], knots[-1], 64 * len(keys))
+        where, facing = positions(fine), orientations(fine)
+        effort = np.linalg.norm(np.diff(where, axis=0), axis=-1) / unit
+        effort = effort + (facing[:-1].inv() * facing[1:]).magnitude()
+        travelled = np.concatenate([[0.0], np.cumsum(effort)])
+        u = np.interp(s * travelled[-1], travelled, fine)
+    c2w = np.tile(np.eye(4), (len(s), 1, 1))
+    c2w[:, :3, :3] = orientations(u).as_matrix()
+    c2w[:, :3, 3] = positions(u)
+    flat = keys.K.reshape(-1, 9)
+    K = np.stack([np.interp(u, knots, flat[:, i]) for i in range(9)], -1).reshape(-1, 3, 3)
+    return Cameras(K, c2w)
+
+
+def _distinct(cameras: Cameras) -> np.ndarray:
+    """Indices of views that differ in pose from the view kept before them."""
+    extent = np.linalg.norm(np.ptp(cameras.centres, axis=0))
+    kept = [0]
+    for view in range(1, len(cameras)):
+        change = cameras.c2w[view] - cameras.c2w[kept[-1]]
+        moved = np.linalg.norm(change[:3, 3]) > 1e-9 * extent
+        if moved or np.abs(change[:3, :3]).max() > 1e-9:
+            kept.append(view)
+    return np.array(kept)
+
+
+def save_path(
+    file: str | Path,
+    cameras: Cameras,
+    height: int,
+    width: int,
+    *,
+    convention: str = "opencv",
+    fps: float | None = None,
+) -> None:
+    """Writes cameras [n] of height x width pictures as a path file, every frame with its K."""
+    if convention not in CONVENTIONS:
+        hint = did_you_mean(convention, CONVENTIONS)
+        raise UserError(f"Unknown camera convention '{convention}': {hint}")
+    cameras = to_host(cameras)
+    poses = cameras.c2w
+    poses = opencv_to_opengl(poses) if convention.startswith("opengl") else poses
+    poses = invert(poses) if convention.endswith("_w2c") else poses
+    entries = [
+        {"pose": pose.tolist(), "K": K.tolist()} for pose, K in zip(poses, cameras.K, strict=True)
+    ]
+    content: dict[str, Any] = {"convention": convention, "width": width, "height": height}
+    content |= {"fps": fps} if fps else {}
+    Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1))
+
+
+def load_path(
+    file: str | Path,
+    *,
+    frames: int | None = None,
+    height: int | None = None,
+    width: int | None = None,
+    context: Cameras | None = None,
+) -> Cameras:
+    """Cameras [n] (float64, OpenCV, world units) of a path file.
+
+    Args:
+      file: our format, a nerfstudio camera path (`camera_path`) or a `transforms.json`.
+      frames: how many frames to make of a file with `keyframes`; a file with `frames` is taken as
+        it is and must have this many.
+      height, width: the pictures to make; K is moved there from the file's own size by a centred
+        crop and a resize. Default: K stays in pixels of the file's size.
+      context: whose first K (in pixels of height x width) is used if the file has no intrinsics.
+    Raises: UserError naming the file, the frame and the field.
+    """
+    file = Path(file)
+    try:
+        content = json.loads(file.read_text())
+    except OSError as error:
+        raise UserError(f"{file}: cannot read the path file ({error.strerror}).") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise UserError(f"{file}: not a JSON file ({error}).") from None
+    if not isinstance(content, dict):
+        raise UserError(f"{file}: expected an object with 'convention' and 'frames'.")
+    entries, field, convention = _entries(content, file)
+    matrices = [_matrix(entry, field, f"{file}, frame {i}") for i, entry in enumerate(entries)]
+    poses = to_opencv(np.stack(matrices), convention)
+    size = _size(content)
+    target = (height, width) if height and width else size
+    K = [
+        _intrinsics(entry, content, size, target, context, f"{file}, frame {i}")
+        for i, entry in enumerate(entries)
+    ]
+    cameras = Cameras(np.stack(K), poses)
+    names = [f"{file.name} frame {i}" for i in range(len(entries))]
+    guess = (int(2 * K[0][1, 2]), int(2 * K[0][0, 2]))
+    cameras = validate(cameras, *(target or guess), names)
+    if "keyframes" in content and "camera_path" not in content:
+        times = _times(entries, file)
+        s = np.linspace(0.0, 1.0, frames or content.get("count") or 81)
+        return interpolate(cameras, s, times=times)
+    if frames is not None and frames != len(cameras):
+        raise UserError(
+            f"{file}: has {len(cameras)} frames but {frames} were asked for: ask for "
+            f"{len(cameras)}, or write 'keyframes' to have them interpolated."
+        )
+    return cameras
+
+
+def _entries(content: dict, file: Path) -> tuple[list[dict], str, str]:
+    """(frames or key frames, name of their matrix, convention)."""
+    if isinstance(content.get("camera_path"), list):
+        entries, field, default = content["camera_path"], "camera_to_world", "opengl"
+    else:
+        entries = content.get("frames", content.get("keyframes"))
+        foreign = isinstance(entries, list) and entries and "transform_matrix" in entries[0]
+        field, default = ("transform_matrix", "opengl") if foreign else ("pose", None)
+    if not isinstance(entries, list) or not entries:
+        raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
+    convention = content.get("convention", default)
+    if convention not in CONVENTIONS:
+        given = "no 'convention'" if convention is None else f"convention '{convention}'"
+        hint = did_you_mean(str(convention), CONVENTIONS)
+        raise UserError(f"{file}: {given}, so its axes are unknown: {hint}")
+    return entries, field, convention
+
+
+def _matrix(entry: dict, field: str, where: str) -> np.ndarray:
+    """The pose of one entry as [4, 4]."""
+    if field not in entry:
+        raise UserError(f"{where}: has no '{field}': give a 4x4 matrix (rows).")
+    try:
+        matrix = np.asarray(entry[field], np.float64)
+        matrix = matrix.reshape(-1, 4) if matrix.size in (12, 16) else matrix
+        if matrix.shape == (3, 4):
+            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape != (4, 4):
+            raise ValueError
+    except (ValueError, TypeError):
+        raise UserError(f"{where}: '{field}' must be a 4x4 matrix of numbers (rows).") from None
+    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
+        raise UserError(f"{where}: '{field}' has NaN, infinite or singular numbers: fix it.")
+    return matrix
+
+
+def _size(content: dict) -> tuple[int, int] | None:
+    """(height, width) of the pictures that the file's intrinsics are for."""
+    for h, w in (("height", "width"), ("h", "w"), ("render_height", "render_width")):
+        if content.get(h) and content.get(w):
+            return int(content[h]), int(content[w])
+    return None
+
+
+def _intrinsics(
+    entry: dict,
+    content: dict,
+    size: tuple[int, int] | None,
+    target: tuple[int, int] | None,
+    context: Cameras | None,
+    where: str,
+) -> np.ndarray:
+    """K [3, 3] of one entry in pixels of `target`: its own, else the file's, else the context's."""
+    source = next((s for s in (entry, content) if any(k in s for k in ("K", "fl_x", "fov"))), None)
+    if source is None:
+        if context is None:
+            raise UserError(f"{where}: no intrinsics: give 'K' (3x3, pixels) or 'fov' (degrees).")
+        return to_host(context).K[0]
+    if "fov" in source and "K" not in source:
+        size = size or target
+        if size is None:
+            raise UserError(f"{where}: 'fov' needs the picture size: give 'height' and 'width'.")
+        fov = float(source["fov"])
+        if not 0 < fov < 180:
+            raise UserError(f"{where}: fov {fov} is the full vertical angle: 0 to 180 degrees.")
+        focal = 0.5 * size[0] / np.tan(np.radians(fov) / 2)
+        K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1.0]])
+    elif "K" in source:
+        K = np.asarray(source["K"], np.float64)
+        if K.shape != (3, 3):
+            raise UserError(f"{where}: 'K' has shape {K.shape}: give a 3x3 matrix in pixels.")
+    else:
+        fx = float(source["fl_x"])
+        fy = float(source.get("fl_y", fx))
+        middle = (0.0, 0.0) if size is None else (size[1] / 2, size[0] / 2)
+        cx, cy = float(source.get("cx", middle[0])), float(source.get("cy", middle[1]))
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    if target is not None and size is None:
+        raise UserError(f"{where}: K needs the picture size it is for: give 'height' and 'width'.")
+    return K if target is None or size == target else crop_resize_K(K, size, target)
+
+
+def _times(entries: list[dict], file: Path) -> np.ndarray | None:
+    """The `time` of every key frame, or None if none has one."""
+    if not any("time" in entry for entry in entries):
+        return None
+    times = np.array([float(entry.get("time", np.nan)) for entry in entries])
+    if not np.all(np.diff(times) > 0):
+        raise UserError(f"{file}: 'time' must be on every key frame, in increasing order.")
+    return times
