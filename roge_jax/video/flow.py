@@ -1,0 +1,290 @@
+"""The flow between photos and noise: path, training noise levels, and the grids samplers walk on.
+
+sigma in [0, 1] is the noise level, 1 = pure noise. Path and target (rectified flow):
+
+    x_sigma = (1 - sigma) x0 + sigma noise,      velocity = dx/dsigma = noise - x0.
+
+Sampling integrates dx/dsigma = v(x, sigma) from sigma = 1 down to 0 (`solvers.py`). Networks of
+the Wan family read the noise level as a *timestep* = 1000 sigma. Grids are float64 NumPy arrays,
+made on the host, so that they are checked before anything is compiled.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from roge_jax.errors import UserError, did_you_mean
+
+TRAIN_POINTS = 1000
+SCHEDULES = ("shift", "unipc", "dpmpp", "uniform", "graded", "optimised")
+WEIGHTS = ("bump", "uniform")
+SIGMA_SAMPLERS = ("uniform_index", "logit_normal")
+OPTIMISED_FILE = Path(__file__).with_name("schedules.json")
+
+
+# ---- path -----------------------------------------------------------------------------------
+
+
+def _per_sample(sigma: Array, x: Array) -> Array:
+    """`sigma` [...] with trailing axes of length 1 so that it multiplies `x` [..., *rest]."""
+    sigma = jnp.asarray(sigma)
+    return sigma.reshape(sigma.shape + (1,) * (x.ndim - sigma.ndim))
+
+
+def x_sigma(x0: Array, noise: Array, sigma: Array) -> Array:
+    """The noised sample (1 - sigma) x0 + sigma noise; sigma is a scalar or has x0's leading axes."""
+    s = _per_sample(sigma, x0)
+    return (1 - s) * x0 + s * noise
+
+
+def velocity_target(x0: Array, noise: Array) -> Array:
+    """What the network learns: d x_sigma / d sigma = noise - x0."""
+    return noise - x0
+
+
+def denoised(x: Array, velocity: Array, sigma: Array) -> Array:
+    """The clean sample implied by a velocity: x0 = x - sigma v."""
+    return x - _per_sample(sigma, x) * velocity
+
+
+def shifted(u, shift: float):
+    """Wan's schedule shift: u -> shift u / (1 + (shift - 1) u); 1 leaves u as it is."""
+    return shift * u / (1 + (shift - 1) * u)
+
+
+def timesteps(sigmas, *, truncate: bool = False) -> np.ndarray:
+    """The numbers the network reads: 1000 sigma. `truncate` drops the fraction, as Wan's code does."""
+    times = 1000.0 * np.asarray(sigmas, np.float64)
+    return np.floor(times) if truncate else times
+
+
+# ---- training ----------------------------------------------------------------------------------
+
+
+def training_table(shift: float = 5.0, weighting: str = "bump") -> tuple[np.ndarray, np.ndarray]:
+    """The training grid and its loss weights, both float64 [1000], sigma from 1 downwards.
+
+    sigma_i = shifted(1 - i / 1000); the bump weights have mean 1 over the grid (DiffSynth-Studio's
+    training scheduler, which FrameCrafter and RoGe inherit).
+    """
+    _known(weighting, WEIGHTS, "loss weighting")
+    sigmas = shifted(1.0 - np.arange(TRAIN_POINTS) / TRAIN_POINTS, shift)
+    if weighting == "uniform":
+        return sigmas, np.ones(TRAIN_POINTS)
+    bump = _bump(sigmas)
+    return sigmas, bump * TRAIN_POINTS / bump.sum()
+
+
+def _bump(sigma: np.ndarray) -> np.ndarray:
+    """Gaussian bump at sigma = 0.5 less its end value: exactly 0 at sigma = 1 (and at 0)."""
+    return np.exp(-2.0 * (sigma - 0.5) ** 2) - np.exp(-0.5)
+
+
+def loss_weight(sigma: Array, *, weighting: str = "bump", shift: float = 5.0) -> Array:
+    """w(sigma) of the training loss, any shape; mean 1 over the training grid of this shift.
+
+    "bump" is largest (2.08) near sigma = 0.5 and exactly 0 at sigma = 1; "uniform" is 1.
+    """
+    _known(weighting, WEIGHTS, "loss weighting")
+    sigma = jnp.asarray(sigma, jnp.float32)
+    if weighting == "uniform":
+        return jnp.ones_like(sigma)
+    total = float(np.sum(_bump(training_table(shift, "uniform")[0])))
+    bump = jnp.exp(-2.0 * (sigma - 0.5) ** 2) - float(np.exp(-0.5))
+    return jnp.maximum(bump, 0.0) * (TRAIN_POINTS / total)
+
+
+def training_sigma(
+    key: Array,
+    shape: tuple[int, ...] = (),
+    *,
+    method: str = "uniform_index",
+    shift: float = 5.0,
+    mean: float = 0.0,
+    std: float = 1.0,
+) -> Array:
+    """Random noise levels, float32 `shape`: one for each sample, shared by all of its slots.
+
+    "uniform_index": a point of the training grid, each equally likely. "logit_normal":
+    shifted(sigmoid(mean + std n)), the practice of large pre-training runs.
+    """
+    _known(method, SIGMA_SAMPLERS, "sigma sampler")
+    if method == "uniform_index":
+        u = 1.0 - jax.random.randint(key, shape, 0, TRAIN_POINTS) / TRAIN_POINTS
+    else:
+        u = jax.nn.sigmoid(mean + std * jax.random.normal(key, shape))
+    return shifted(u.astype(jnp.float32), shift)
+
+
+def bf16_training_index(index, shift: float = 5.0) -> np.ndarray:
+    """The grid point DiffSynth really trains at when it draws `index` [...].
+
+    It rounds the timestep to bfloat16 and looks the result up again, so only 294 of the 1000
+    points are ever used. Kept to explain and reproduce checkpoints; not used by our training.
+    """
+    times = np.float32(1000) * training_table(shift)[0].astype(np.float32)
+    rounded = times[np.asarray(index)].astype(jnp.bfloat16).astype(np.float32)
+    return np.abs(times - rounded[..., None]).argmin(-1)
+
+
+# ---- grids for sampling ----------------------------------------------------------------------
+
+
+def schedule(
+    name: str,
+    steps: int,
+    *,
+    shift: float = 5.0,
+    power: float = 2.0,
+    sigma_min: float = 0.0,
+    breaks: Sequence[float] = (),
+    solver: str = "euler",
+) -> np.ndarray:
+    """A descending grid of noise levels, float64 [steps + 1], last one 0.
+
+    "shift"      linspace(1, 0) shifted: the predecessor's Euler grid (DiffSynth-Studio)
+    "unipc"      linspace(0.999, 0) shifted: Wan's own default
+    "dpmpp"      Wan's grid for DPM-Solver++; the same points as "shift"
+    "uniform"    linspace(1, 0); `shift` does not apply
+    "graded"     u^power, finer towards 0; with `sigma_min` it walks to there and jumps to 0
+    "optimised"  found offline for `solver` (`optimise_schedule`), read from schedules.json
+
+    `breaks`: noise levels that must be grid points, such as the ends of a guidance interval; the
+    pieces between them are stretched, the number of steps stays.
+    """
+    _known(name, SCHEDULES, "schedule")
+    if not isinstance(steps, int | np.integer) or steps < 1:
+        raise UserError(
+            f"The number of sampling steps is {steps!r}; it must be a whole number >= 1."
+        )
+    if not shift > 0:
+        raise UserError(f"The schedule shift is {shift}; it must be above 0 (1 means no shift).")
+    u = np.linspace(1.0, 0.0, steps + 1)
+    if name in ("shift", "dpmpp"):
+        sigmas = shifted(u, shift)
+    elif name == "unipc":  # the official code starts at float32(0.999), not at 0.999
+        sigmas = shifted(np.linspace(float(np.float32(0.999)), 0.0, steps + 1), shift)
+    elif name == "uniform":
+        sigmas = u
+    elif name == "graded":
+        sigmas = _graded(steps, power, sigma_min)
+    else:
+        sigmas = _optimised(steps, solver)
+    sigmas[-1] = 0.0
+    return with_breaks(sigmas, breaks)
+
+
+def _graded(steps: int, power: float, sigma_min: float) -> np.ndarray:
+    if not power >= 1:
+        raise UserError(f"The grading power is {power}; it must be at least 1 (1 is uniform).")
+    if not 0 <= sigma_min < 1:
+        raise UserError(f"sigma_min is {sigma_min}; it must lie in [0, 1).")
+    if sigma_min == 0:
+        return np.linspace(1.0, 0.0, steps + 1) ** power
+    if steps == 1:
+        return np.array([1.0, 0.0])
+    low = sigma_min ** (1 / power)
+    return np.append((low + (1 - low) * np.linspace(1.0, 0.0, steps)) ** power, 0.0)
+
+
+def _optimised(steps: int, solver: str) -> np.ndarray:
+    table = json.loads(OPTIMISED_FILE.read_text()) if OPTIMISED_FILE.exists() else {}
+    stored = table.get("grids", {}).get(solver, {})
+    if str(steps) not in stored:
+        have = ", ".join(
+            f"{name}: {'/'.join(grids)}" for name, grids in table.get("grids", {}).items()
+        )
+        raise UserError(
+            f"No optimised schedule for solver '{solver}' with {steps} steps is stored; there is "
+            f"{have or 'none at all'}. Use another schedule, or make one with optimise_schedule."
+        )
+    return np.asarray(stored[str(steps)], np.float64)
+
+
+def with_breaks(sigmas: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
+    """The grid with every break inside it moved onto a grid point; same number of points.
+
+    A field that jumps at a noise level (guidance that switches on or off) costs every method its
+    order unless the jump is a grid point. The nearest interior point moves to each break and the
+    pieces between are stretched, so that the grid stays smooth within each piece.
+    """
+    sigmas = np.asarray(sigmas, np.float64)
+    inner = sorted({float(b) for b in breaks if sigmas[-1] < b < sigmas[0]}, reverse=True)
+    count = len(sigmas)
+    if not inner:
+        return sigmas  # untouched: official timesteps depend on the last bit
+    if len(inner) > count - 2:
+        raise UserError(
+            f"{count - 1} sampling steps cannot meet {len(inner)} guidance ends inside the grid; "
+            f"at least {len(inner) + 1} steps are needed."
+        )
+    index = [0]
+    for i, b in enumerate(inner):
+        low, high = index[-1] + 1, count - 2 - (len(inner) - 1 - i)
+        index.append(low + int(np.abs(sigmas[low : high + 1] - b).argmin()))
+    index.append(count - 1)
+    fixed = [sigmas[0], *inner, sigmas[-1]]
+    out = np.interp(-sigmas, -sigmas[index], fixed)  # interp wants ascending abscissae
+    out[index] = fixed
+    return out
+
+
+# ---- schedules found offline --------------------------------------------------------------------
+
+
+def euler_jump_errors(sigmas: np.ndarray, states: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    """Squared error of one Euler jump between any two points of a fine teacher trajectory.
+
+    `sigmas` [k] descending, `states` and `velocities` [k, ...] on the teacher's path (several
+    samples may share the trailing axes). Returns [k, k]: entry (i, j), i < j, is the mean squared
+    difference of x_i + (sigma_j - sigma_i) v_i and x_j; other entries are infinite.
+    """
+    count = len(sigmas)
+    x = np.asarray(states, np.float64).reshape(count, -1)
+    v = np.asarray(velocities, np.float64).reshape(count, -1)
+    errors = np.full((count, count), np.inf)
+    for i in range(count - 1):
+        jump = x[i][None] + (np.asarray(sigmas)[i + 1 :] - sigmas[i])[:, None] * v[i][None]
+        errors[i, i + 1 :] = np.mean((jump - x[i + 1 :]) ** 2, axis=1)
+    return errors
+
+
+def optimise_schedule(sigmas: np.ndarray, errors: np.ndarray, steps: int) -> np.ndarray:
+    """The `steps`-step grid through the teacher's points with the least total jump error.
+
+    `sigmas` [k] is the teacher's fine grid, `errors` [k, k] the cost of jumping from point i to a
+    later point j (`euler_jump_errors`, or measured for any one-step solver). Exact shortest path
+    with a fixed number of edges, by dynamic programming, O(steps k^2). Returns float64 [steps + 1].
+    """
+    sigmas = np.asarray(sigmas, np.float64)
+    count = len(sigmas)
+    if not 1 <= steps <= count - 1:
+        raise UserError(
+            f"{steps} steps cannot be chosen from a teacher with {count - 1}; allowed 1..{count - 1}."
+        )
+    allowed = np.where(np.arange(count)[:, None] < np.arange(count)[None], errors, np.inf)
+    cost = np.full(count, np.inf)
+    cost[0] = 0.0
+    previous = []
+    for _ in range(steps):
+        total = cost[:, None] + allowed
+        previous.append(total.argmin(0))
+        cost = total.min(0)
+    if not np.isfinite(cost[-1]):
+        raise UserError(
+            "The teacher trajectory holds non-finite errors; no schedule can be chosen."
+        )
+    path = [count - 1]
+    for row in reversed(previous):
+        path.append(int(row[path[-1]]))
+    return sigmas[path[::-1]]
+
+
+def _known(word: str, options: Sequence[str], what: str) -> None:
+    if word not in options:
+        raise UserError(f"Unknown {what} '{word}'; {did_you_mean(word, options)}")

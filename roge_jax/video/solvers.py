@@ -1,0 +1,295 @@
+"""Samplers: integrate dx/dsigma = v(x, sigma) from noise (sigma = 1) to the clean sample (0).
+
+    grid = schedule("shift", 20, shift=5.0)
+    x0, info = solve("unipc_2", velocity, noise, grid)
+    raise_if_failed(info)
+
+`velocity(x, sigma)` takes the state and a scalar noise level (a network multiplies it by 1000). The
+state is float32 whatever the velocity's dtype: a bfloat16 state gets *worse* with more steps once
+the steps fall below its rounding (tests/test_solvers.py). The first non-finite number stops the
+network from being called again; `info` says where. Everything here may be jitted; a `Table` passed
+as an argument makes one compilation serve every grid of its length.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from roge_jax.errors import UserError
+from roge_jax.video.solver_table import SOLVERS, Table, check_grid, nfe, tabulate
+
+__all__ = [
+    "SOLVERS",
+    "SamplingError",
+    "SolveInfo",
+    "Table",
+    "check_grid",
+    "guided",
+    "iterate",
+    "nfe",
+]
+__all__ += ["raise_if_failed", "solve", "tabulate"]
+
+Velocity = Callable[[Array, Array], Array]
+Project = Callable[[Array, Array], Array]
+
+FINE, BAD_VELOCITY, BAD_STATE, OUT_OF_BUDGET = range(4)
+
+
+class SamplingError(RuntimeError):
+    """The sampler stopped early; the message says at which step, noise level and tensor."""
+
+
+@struct.dataclass
+class SolveInfo:
+    """What happened on the way; all scalars but `states`."""
+
+    evaluations: Array  # velocity evaluations made, int32
+    rejected: Array  # evaluations thrown away by step control, int32 (0 on a fixed grid)
+    cause: Array  # FINE, BAD_VELOCITY, BAD_STATE or OUT_OF_BUDGET, int32
+    step: Array  # step of the failure, int32, -1 if fine
+    sigma: Array  # noise level of the failure
+    bad: Array  # non-finite numbers found there, int32
+    size: Array  # numbers in the state, int32
+    states: Array | None = None  # [n + 1, ...] the state at each grid point, if asked for
+
+    @property
+    def failed(self) -> Array:
+        return self.cause != FINE
+
+
+def raise_if_failed(info: SolveInfo) -> None:
+    """Raise SamplingError naming step, sigma and tensor. Call it outside jit."""
+    cause = int(info.cause)
+    if cause == FINE:
+        return
+    where = f"step {int(info.step)}, sigma {float(info.sigma):.6g}"
+    if cause == OUT_OF_BUDGET:
+        raise SamplingError(
+            f"The adaptive solver used all its {int(info.evaluations)} evaluations and stands at {where} "
+            f"({int(info.rejected)} rejected). Allow more, loosen the tolerance, or name the noise "
+            "levels where the field jumps in `breaks`."
+        )
+    tensor = "velocity (the network's output)" if cause == BAD_VELOCITY else "state"
+    raise SamplingError(
+        f"The {tensor} is not finite at {where}: {int(info.bad)} of {int(info.size)} numbers. Sampling "
+        f"stopped after {int(info.evaluations)} evaluations."
+    )
+
+
+def guided(
+    conditional: Velocity,
+    unconditional: Velocity,
+    scale: float,
+    interval: tuple[float, float] = (0.0, 1.0),
+) -> Velocity:
+    """Guidance v = v_u + scale (v_c - v_u) for sigma in `interval` (low, high), v_c elsewhere.
+
+    Outside the interval the unconditional network is not called. Give the interval as `breaks` to
+    `schedule` and `solve`: a switch inside a step costs every method its order.
+    """
+    low, high = interval
+    if not 0 <= low < high <= 1:
+        raise UserError(
+            f"The guidance interval is {interval}; it must be (low, high) within [0, 1]."
+        )
+
+    def velocity(x: Array, sigma: Array) -> Array:
+        v_c = conditional(x, sigma)
+
+        def both() -> Array:
+            v_u = unconditional(x, sigma)
+            return (v_u + scale * (v_c - v_u)).astype(v_c.dtype)
+
+        return jax.lax.cond((sigma >= low) & (sigma <= high), both, lambda: v_c)
+
+    return velocity
+
+
+def solve(
+    solver: str | Table,
+    velocity: Velocity,
+    x1: Array,
+    sigmas: np.ndarray | None = None,
+    *,
+    breaks: Sequence[float] = (),
+    project: Project | None = None,
+    keep_states: bool = False,
+    state_dtype: jnp.dtype | None = None,
+    tolerance: float = 1e-3,
+    max_evaluations: int = 1000,
+) -> tuple[Array, SolveInfo]:
+    """Integrate from `x1` at sigmas[0] to sigmas[-1]; returns (x0, info).
+
+    `solver`: a name of SOLVERS with a grid `sigmas` [n + 1], or a Table (which holds its grid).
+    `breaks`: noise levels where the field jumps (guidance ends); grid points, see `schedule`.
+    `project(x, sigma)`: applied to the state before each evaluation at that evaluation's sigma,
+    and to the result; RoGe holds context slots at the known latents with it.
+    `tolerance`, `max_evaluations` are for "bosh3", which takes from the grid only its two ends,
+    the first step and the last (one Euler step from the last positive sigma to 0).
+
+    x1 any shape [...]; x0 has its shape in the state's dtype (float32, or float64 if x1 is).
+    Under vmap a stopped sample still pays for the network; batch inside the state instead.
+    """
+    dtype = jnp.promote_types(x1.dtype, jnp.float32) if state_dtype is None else state_dtype
+    if isinstance(solver, str) and solver in SOLVERS and SOLVERS[solver].method is None:
+        from roge_jax.video.adaptive import solve_bosh3  # adaptive.py imports this module
+
+        assert sigmas is not None and not keep_states
+        x, info = solve_bosh3(
+            velocity,
+            x1.astype(dtype),
+            check_grid(sigmas, breaks),
+            breaks=breaks,
+            project=project,
+            tolerance=tolerance,
+            max_evaluations=max_evaluations,
+        )
+        return x, info
+    table = _table(solver, sigmas, breaks)
+    stored = _start(table, x1.astype(dtype))
+
+    def body(carry, row):
+        stored, info = carry
+        stored, info, x = _evaluate(velocity, project, stored, info, row)
+        return (stored, info), (x if keep_states else None)
+
+    rows = _rows(table)
+    (stored, info), seen = jax.lax.scan(body, (stored, _fresh_info(x1.size, dtype)), rows)
+    end = jnp.asarray(table.grid, jnp.promote_types(dtype, jnp.float32))[-1]
+    x0 = stored[0] if project is None else project(stored[0], end).astype(dtype)
+    info = _note(info, x0, BAD_STATE, len(table.grid) - 1, end)
+    if keep_states:
+        info = info.replace(states=jnp.concatenate([seen[table.first], x0[None]]))
+    return x0, info
+
+
+def iterate(
+    solver: str | Table,
+    velocity: Velocity,
+    x1: Array,
+    sigmas: np.ndarray | None = None,
+    *,
+    breaks: Sequence[float] = (),
+    project: Project | None = None,
+) -> Iterator[tuple[int, int, Array]]:
+    """`solve` as a Python loop for progress bars: yields (evaluations done, all, current x).
+
+    The last x is the result. `velocity` is called from Python: jit it once and reuse it. Raises
+    SamplingError at the first non-finite number, so nothing needs to be checked afterwards.
+    """
+    table = _table(solver, sigmas, breaks)
+    dtype = jnp.promote_types(x1.dtype, jnp.float32)
+    stored = _start(table, x1.astype(dtype))
+    info, rows = _fresh_info(x1.size, dtype), _rows(table)
+    count = len(table.sigma)
+    for e in range(count):
+        row = jax.tree.map(lambda leaf, e=e: leaf[e], rows)
+        x, sigma = _look(stored[0], project, row)
+        info = _note(info, x, BAD_STATE, row["step"], sigma)
+        raise_if_failed(info)
+        v = velocity(x, sigma)
+        info = _note(
+            info.replace(evaluations=info.evaluations + 1), v, BAD_VELOCITY, row["step"], sigma
+        )
+        raise_if_failed(info)
+        stored = _mix_jit(row["mix"], stored, v)
+        yield e + 1, count, stored[0]
+    end = jnp.asarray(table.grid[-1], stored.dtype)
+    x0 = stored[0] if project is None else project(stored[0], end)
+    raise_if_failed(_note(info, x0, BAD_STATE, len(table.grid) - 1, end))
+    if project is not None:
+        yield count, count, x0
+
+
+# ---- one evaluation ------------------------------------------------------------------------------
+
+
+def _table(solver: str | Table, sigmas, breaks: Sequence[float]) -> Table:
+    if isinstance(solver, Table):
+        assert sigmas is None and not breaks, "a Table holds its grid and its breaks"
+        return solver
+    if sigmas is None:
+        raise UserError(f"solve('{solver}', ...) needs a sigma grid; make one with schedule().")
+    return tabulate(solver, sigmas, breaks=breaks)
+
+
+def _start(table: Table, x1: Array) -> Array:
+    """[R, ...] the stored vectors before the first evaluation; all are multiples of x1."""
+    begin = jnp.asarray(table.begin, x1.dtype).reshape((-1,) + (1,) * x1.ndim)
+    return begin * x1[None]
+
+
+def _rows(table: Table) -> dict[str, Array]:
+    names = ("sigma", "side", "step", "mix")
+    return {name: jnp.asarray(getattr(table, name)) for name in names}
+
+
+def _fresh_info(size: int, dtype) -> SolveInfo:
+    zero = jnp.int32(0)
+    sigma = jnp.zeros((), jnp.promote_types(dtype, jnp.float32))
+    return SolveInfo(zero, zero, jnp.int32(FINE), jnp.int32(-1), sigma, zero, jnp.int32(size))
+
+
+def _note(info: SolveInfo, x: Array, cause: int, step, sigma: Array) -> SolveInfo:
+    """Record the first failure: `x` holds numbers that are not finite."""
+    bad = jnp.sum(~jnp.isfinite(x), dtype=jnp.int32)
+    new = (bad > 0) & (info.cause == FINE)
+    pick = lambda now, old: jnp.where(new, jnp.asarray(now, old.dtype), old)  # noqa: E731
+    return info.replace(
+        cause=pick(cause, info.cause),
+        step=pick(step, info.step),
+        sigma=pick(sigma, info.sigma),
+        bad=pick(bad, info.bad),
+    )
+
+
+def _look(x: Array, project: Project | None, row: dict[str, Array]) -> tuple[Array, Array]:
+    """The state and noise level of an evaluation; just inside its step where the field jumps."""
+    sigma = row["sigma"].astype(jnp.promote_types(x.dtype, jnp.float32))
+    inside = jnp.nextafter(sigma, sigma + row["side"].astype(sigma.dtype))
+    sigma = jnp.where(row["side"] == 0, sigma, inside)
+    return (x if project is None else project(x, sigma).astype(x.dtype)), sigma
+
+
+def _mix(mix: Array, stored: Array, v: Array) -> Array:
+    """New stored vectors [R, ...]. Sums, not a matmul: accelerators round matmul inputs."""
+    work = jnp.promote_types(stored.dtype, jnp.float32)
+    vectors = [*stored.astype(work), v.astype(work)]
+    mix = mix.astype(work)
+    rows = []
+    for r in range(len(stored)):
+        total = mix[r, 0] * vectors[0]
+        for k in range(1, len(vectors)):
+            total = total + mix[r, k] * vectors[k]
+        rows.append(total)
+    return jnp.stack(rows).astype(stored.dtype)
+
+
+_mix_jit = jax.jit(_mix)
+
+
+def _evaluate(
+    velocity: Velocity,
+    project: Project | None,
+    stored: Array,
+    info: SolveInfo,
+    row: dict[str, Array],
+) -> tuple[Array, SolveInfo, Array]:
+    """One row of the table. After a failure nothing moves and the network is not called."""
+    x, sigma = _look(stored[0], project, row)
+    info = _note(info, x, BAD_STATE, row["step"], sigma)
+
+    def call() -> tuple[Array, SolveInfo]:
+        v = velocity(x, sigma)
+        after = info.replace(evaluations=info.evaluations + 1)
+        after = _note(after, v, BAD_VELOCITY, row["step"], sigma)
+        mixed = _mix(row["mix"], stored, v)
+        return jnp.where(after.failed, stored, mixed), after
+
+    stored, info = jax.lax.cond(info.failed, lambda: (stored, info), call)
+    return stored, info, x
