@@ -15,8 +15,17 @@ import numpy as np
 from ..config import DiTConfig
 from ..core.attention import attention, merge_heads, split_heads
 from ..core.layers import (
-    gelu, layer_norm, lift, linear, linear_specs, mlp, norm_specs,
-    patch_conv, patch_conv_specs, rms_norm, unpatchify,
+    gelu,
+    layer_norm,
+    lift,
+    linear,
+    linear_specs,
+    mlp,
+    norm_specs,
+    patch_conv,
+    patch_conv_specs,
+    rms_norm,
+    unpatchify,
 )  # fmt: skip
 from ..core.params import Initialiser, Spec, Tree, normal, stack, zeros
 from ..core.rope import frequencies, rotate_pairs
@@ -28,7 +37,7 @@ EPS = 1e-6  # every norm of the blocks and of the head
 CLIP_EPS = 1e-5  # the two norms of the CLIP embedding
 
 # Leaves that stay float32 when the frozen weights are cast to bfloat16 (the official autocast computes them so).
-FLOAT32_LEAVES = r"(^|/)(modulation|scale)$|(^|/)norm\w*/bias$|^time_embed/|^head/"
+FLOAT32_LEAVES = r"(^|/)(modulation|scale)$|norm\w*/bias$|^time_embed/|^head/"
 
 
 def _uniform(bound: float) -> Initialiser:
