@@ -20,7 +20,7 @@ import numpy as np
 from ..config import VAEConfig
 from ..core.attention import attention
 from ..core.layers import lift, linear, linear_specs
-from ..core.params import Spec, Tree, fan_in, flatten, init, ones, unflatten, zeros
+from ..core.params import Spec, Tree, fan_in, flatten, ones, unflatten, zeros
 from ..errors import UserError
 
 SPACE, TIME = 8, 4  # compression
@@ -320,6 +320,8 @@ def decode_frames(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 
 def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`encode` one latent frame at a time: the same latents in memory that does not grow with the clip."""
+    if video.shape[0] == 1:
+        return encode(p, video, cfg=cfg)
     _check_video(video)
     first, past = encoder(p["encoder"], video[:1], None, cfg=cfg)
 
@@ -334,6 +336,8 @@ def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 
 def decode_chunked(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`decode` one latent frame at a time."""
+    if latents.shape[0] == 1:
+        return decode(p, latents, cfg=cfg)
     z = linear(p["post_quant"], denormalise(latents, cfg=cfg))
     first, past = decoder(p["decoder"], z[:1], None, cfg=cfg)
 
@@ -354,33 +358,37 @@ def passthrough_init(key: jax.Array, cfg: VAEConfig, *, noise: float = 0.1) -> T
     exactly. Down-sampling starts as a 2x2 average and up-sampling as repetition followed by an orthogonal
     projection, plus `noise` times a random kernel; residual branches start at `noise` times their usual scale.
     """
-    random = flatten(init(key, vae_specs(cfg)))
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))  # NumPy: nothing to compile
     tree = {}
-    for path, value in random.items():
+    for path, spec in flatten(vae_specs(cfg)).items():
         module, leaf = path.rsplit("/", 1)
         if leaf == "kernel":
-            value = _passthrough(module, value, noise)
-        tree[path] = value
+            kernel = rng.standard_normal(spec.shape) / np.sqrt(np.prod(spec.shape[:-1]))
+            tree[path] = jnp.asarray(_passthrough(module, kernel, noise), spec.dtype)
+        else:
+            tree[path] = spec.init(key, spec.shape, spec.dtype)  # zeros and ones
     return unflatten(tree)
 
 
-def _passthrough(module: str, kernel: jax.Array, noise: float) -> jax.Array:
+def _passthrough(module: str, kernel: np.ndarray, noise: float) -> np.ndarray:
     c_in, c_out = kernel.shape[-2:]
-    if module.endswith("down/time"):
-        return jnp.zeros_like(kernel).at[-1].set(jnp.eye(c_in))
-    if module.endswith("up/time"):
-        return jnp.zeros_like(kernel).at[-1].set(jnp.concatenate([jnp.eye(c_in)] * 2, axis=1))
-    if module.endswith("down/conv"):
-        return (noise * kernel).at[:2, :2].add(jnp.eye(c_in)[None, None] / 4)
-    if module.endswith("up/conv"):
-        q, _ = jnp.linalg.qr(kernel[1, 1])
-        return (noise * kernel).at[1, 1].set(q)
-    if module.endswith("shortcut"):
-        q, _ = jnp.linalg.qr(kernel.T if c_in < c_out else kernel)
-        return q.T if c_in < c_out else q
-    if kernel.ndim == 5:
-        scale = np.sqrt(3.0) * (noise if module.endswith("conv2") else 1.0)  # a third of the inputs
-        return jnp.zeros_like(kernel).at[-1].set(np.float32(scale) * kernel[-1])
+    if module.endswith(("down/time", "up/time")):  # the newest frame, once or twice
+        kernel = np.zeros_like(kernel)
+        kernel[-1] = np.tile(np.eye(c_in), c_out // c_in)
+    elif module.endswith("down/conv"):
+        kernel = noise * kernel
+        kernel[:2, :2] += np.eye(c_in) / 4
+    elif module.endswith("up/conv"):
+        centre, _ = np.linalg.qr(kernel[1, 1])
+        kernel = noise * kernel
+        kernel[1, 1] = centre
+    elif module.endswith("shortcut"):
+        q, _ = np.linalg.qr(kernel.T if c_in < c_out else kernel)
+        kernel = q.T if c_in < c_out else q
+    elif kernel.ndim == 5:  # a third of the inputs count
+        newest = np.sqrt(3.0) * (noise if module.endswith("conv2") else 1.0) * kernel[-1]
+        kernel = np.zeros_like(kernel)
+        kernel[-1] = newest
     return kernel
 
 
