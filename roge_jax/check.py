@@ -1,0 +1,293 @@
+"""What is wrong with a scene, where, and how to mend it.
+
+    python -m roge_jax.check SCENE [--json] [--convention opencv] [--no-matching]
+
+SCENE is a folder or file in any layout that `data.readers` knows, `motorcycle` or
+`procedural:SEED`. Exit code 0 if the scene can be used, 2 if not.
+"""
+
+import dataclasses
+import json
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.data.matching import pose_agreement
+from roge_jax.data.scene import Scene, open_scene
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import (
+    CONVENTIONS,
+    Cameras,
+    field_of_view,
+    inspect,
+    invert,
+    normalise,
+    opencv_to_opengl,
+    straightness,
+    to_opencv,
+)
+from roge_jax.geometry.crops import cover_window
+from roge_jax.geometry.trajectories import focus_distance
+from roge_jax.geometry.validation import Finding, axes_votes
+
+BAD_FIT = (
+    3.0  # pixels of median epipolar distance: good poses reach 0.1 to 1, wrong axes 20 and more
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Checks a scene."""
+
+    scene: str
+    """A scene folder or file, `motorcycle` or `procedural:SEED`."""
+    json: bool = False
+    """Print the report as JSON."""
+    convention: str | None = None
+    """Axes of the poses of a transforms.json: opencv, opencv_w2c, opengl or opengl_w2c."""
+    height: int = 192
+    """Height of the pictures to be made, to say how much of a photo the crop keeps."""
+    width: int = 336
+    """Width of the pictures to be made."""
+    matching: bool = True
+    """Compare the poses with matched features of the photos (a few seconds)."""
+    debug: bool = False
+    """Show where in the program an error comes from."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """Everything `check` found: numbers about the scene, and findings from worst to mildest."""
+
+    scene: str
+    numbers: dict[str, Any]
+    findings: list[Finding]
+
+    @property
+    def usable(self) -> bool:
+        """Whether the scene can be loaded."""
+        return not any(finding.severity == "error" for finding in self.findings)
+
+
+def check(config: Config) -> Report:
+    """Reads the scene without stopping at the first fault and reports all of them."""
+    try:
+        scene = open_scene(
+            config.scene,
+            convention=config.convention,
+            frames=16,
+            height=config.height,
+            width=config.width,
+        )
+    except UserError as error:
+        finding = Finding("error", "scene", str(error).rstrip("."), "nothing else was looked at")
+        return Report(config.scene, {}, [finding])
+    heights, widths = zip(*scene.sizes, strict=True)
+    cameras, findings = inspect(scene.cameras, heights, widths, scene.names)
+    findings = [*scene.notes, *findings]
+    broken = any(finding.severity == "error" for finding in findings)
+    numbers: dict[str, Any] = {"photos": len(scene), "sizes": _sizes(scene)}
+    if not broken:
+        numbers |= _numbers(scene, cameras, config)
+        findings += _about_poses(scene, cameras)
+    findings += _about_photos(scene, config)
+    if not broken and config.matching and not any(f.severity == "error" for f in findings):
+        agreement, more = _about_agreement(scene, cameras, config)
+        numbers |= agreement
+        findings += more
+    order = ("error", "warning", "note")
+    return Report(config.scene, numbers, sorted(findings, key=lambda f: order.index(f.severity)))
+
+
+def _sizes(scene: Scene) -> dict[str, int]:
+    """How many photos have which size, e.g. {"640 x 426": 15}."""
+    sizes = [f"{width} x {height}" for height, width in scene.sizes]
+    return {size: sizes.count(size) for size in dict.fromkeys(sizes)}
+
+
+def _numbers(scene: Scene, cameras: Cameras, config: Config) -> dict[str, Any]:
+    _, _, info = normalise(cameras, cameras)
+    fov = [
+        np.degrees(field_of_view(K[None], *size)).ravel()
+        for K, size in zip(cameras.K, scene.sizes, strict=True)
+    ]
+    steps = np.linalg.norm(np.diff(cameras.centres, axis=0), axis=-1)
+    front, behind = axes_votes(cameras.c2w[:: max(1, len(cameras) // 40)])
+    size = (config.height, config.width)
+    windows = [cover_window(source, size) for source in scene.sizes]
+    kept = [w[2] * w[3] / (s[0] * s[1]) for w, s in zip(windows, scene.sizes, strict=True)]
+    return {
+        "vertical_fov_degrees": [float(min(f[0] for f in fov)), float(max(f[0] for f in fov))],
+        "horizontal_fov_degrees": [float(min(f[1] for f in fov)), float(max(f[1] for f in fov))],
+        "baseline_max": info.context_reach,
+        "baseline_neighbours": float(np.median(steps)) if len(steps) else 0.0,
+        "focus_distance": focus_distance(cameras),
+        "status": info.status,
+        "divisor": info.divisor,
+        "straightness": straightness(cameras) if len(cameras) > 1 else float("nan"),
+        "axes_meet_in_front": front,
+        "axes_meet_behind": behind,
+        "offset": float(np.abs(cameras.centres).max()),
+        "crop_keeps": float(min(kept)),
+    }
+
+
+def _about_poses(scene: Scene, cameras: Cameras) -> list[Finding]:
+    """Duplicate poses, one place, far from the origin."""
+    findings = []
+    seen: dict[bytes, str] = {}
+    for name, pose in zip(scene.names, cameras.c2w, strict=True):
+        twin = seen.setdefault(pose.tobytes(), name)
+        if twin != name:
+            fix = "keep one if it is the same photo, else correct its pose"
+            findings.append(Finding("warning", f"view {name}", f"has the pose of {twin}", fix))
+    _, _, info = normalise(cameras, cameras)
+    if info.status != "ok":
+        what = f"the photos fix no scale ({info.status.replace('_', ' ')})"
+        fix = "paths are measured in units of the distance to what is in focus; give a scale"
+        findings.append(Finding("note", "cameras", what, fix))
+    offset = np.abs(cameras.centres).max()
+    if info.context_reach > 0 and offset > 1e3 * info.context_reach:
+        what = f"positions up to {offset:.3g} in a scene of size {info.context_reach:.3g}"
+        fix = "fine here (float64 until re-centred), but other programs will lose precision"
+        findings.append(Finding("note", "cameras", what, fix))
+    flat = straightness(cameras) if len(cameras) > 2 else float("nan")
+    if flat < 1e-2:
+        what = f"camera positions lie on a line (straightness {flat:.1e})"
+        fix = "fine for rays; rotation errors after alignment mean nothing, use relative ones"
+        findings.append(Finding("note", "cameras", what, fix))
+    return findings
+
+
+def _about_photos(scene: Scene, config: Config) -> list[Finding]:
+    """Damaged, blank or badly cropped photos."""
+    findings = []
+    aspects = [width / height for height, width in scene.sizes]
+    for view, name in enumerate(scene.names):
+        try:
+            image = scene.images[view]
+        except UserError as error:
+            what = str(error).rstrip(".")
+            findings.append(Finding("error", f"view {view}", what, "replace the file"))
+            continue
+        if image.std() < 0.004:
+            fix = "remove the view or replace the photo"
+            findings.append(Finding("warning", f"view {view} ({name})", "is of one colour", fix))
+    if max(aspects) > 2 * min(aspects):
+        what = f"aspect ratios from {min(aspects):.2f} to {max(aspects):.2f}"
+        findings.append(Finding("warning", "photos", what, "use only alike ones together"))
+    gap = max(config.width / config.height / a for a in aspects)
+    gap = max(gap, max(a * config.height / config.width for a in aspects))
+    if gap > 2:
+        what = f"{config.width} x {config.height} pictures keep only {1 / gap:.0%} of a photo"
+        findings.append(Finding("warning", "photos", what, "choose a height and width like theirs"))
+    return findings
+
+
+def _about_agreement(
+    scene: Scene, cameras: Cameras, config: Config
+) -> tuple[dict[str, Any], list[Finding]]:
+    """Whether matched features fit the poses, and if not, whether another convention would."""
+    now = config.convention or ("opengl" if _is_nerfstudio(scene) else "opencv")
+    raw = opencv_to_opengl(cameras.c2w) if now.startswith("opengl") else cameras.c2w
+    raw = invert(raw) if now.endswith("_w2c") else raw
+    others = [convention for convention in CONVENTIONS if convention != now]
+    candidates = {now: cameras}
+    candidates |= {c: Cameras(cameras.K, to_opencv(raw, c)) for c in others}
+    try:
+        distances, pairs = pose_agreement(scene.images, candidates)
+    except ImportError:
+        return {}, [Finding("note", "poses", "not compared with the photos", "install OpenCV")]
+    if pairs == 0:
+        what = "no two photos could be matched, so the poses are untested"
+        return {}, [Finding("note", "poses", what, "more overlap or texture would help")]
+    numbers = {"epipolar_pixels": distances[now], "epipolar_pairs": pairs}
+    best = min(others, key=lambda c: distances[c])
+    if distances[now] <= BAD_FIT:
+        return numbers, []
+    what = f"matched features lie {distances[now]:.1f} pixels from where the poses put them"
+    if distances[best] < min(BAD_FIT, distances[now] / 3):
+        fix = f"read as '{best}' it is {distances[best]:.2f}: pass convention='{best}'"
+        return numbers, [Finding("error", "poses", what, fix)]
+    fix = "check intrinsics, picture order and poses (moving things also do this)"
+    return numbers, [Finding("warning", "poses", what, fix)]
+
+
+def _is_nerfstudio(scene: Scene) -> bool:
+    source = Path(scene.source)
+    return source.suffix == ".json" or (source / "transforms.json").is_file()
+
+
+def render(report: Report) -> str:
+    """The report for people."""
+    n = report.numbers
+    lines = [f"scene     {report.scene}"]
+    if n:
+        sizes = ", ".join(f"{count} of {size}" for size, count in n["sizes"].items())
+        lines.append(f"photos    {n['photos']}: {sizes}")
+    if "divisor" in n:
+        (v0, v1), (h0, h1) = n["vertical_fov_degrees"], n["horizontal_fov_degrees"]
+        lines += [
+            f"view      {_span(h0, h1)} x {_span(v0, v1)} degrees; a crop keeps {n['crop_keeps']:.0%}",
+            f"baseline  {n['baseline_max']:.4g} at most, {n['baseline_neighbours']:.4g} between "
+            f"neighbours; the scene is about {n['focus_distance']:.4g} away",
+            f"scale     divisor {n['divisor']:.6g} ({n['status']}); straightness "
+            f"{n['straightness']:.3g}; coordinates up to {n['offset']:.4g}",
+            f"axes      meet in front of the cameras in {n['axes_meet_in_front']} pairs, behind in "
+            f"{n['axes_meet_behind']}",
+        ]
+    if "epipolar_pixels" in n:
+        lines.append(
+            f"poses     matched features fit them to {n['epipolar_pixels']:.2f} pixels "
+            f"(median of {n['epipolar_pairs']} pairs)"
+        )
+    lines += [f"{finding.severity:9s} {finding}" for finding in report.findings]
+    lines.append("result    " + ("can be used" if report.usable else "cannot be used as it is"))
+    return "\n".join(lines)
+
+
+def _span(low: float, high: float) -> str:
+    return f"{low:.1f}" if high - low < 0.05 else f"{low:.1f}-{high:.1f}"
+
+
+def main(config: Config) -> int:
+    """Prints the report; the exit code."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # all of it is in the report
+        report = check(config)
+    if config.json:
+        content = dataclasses.asdict(report) | {"usable": report.usable}
+        print(json.dumps(_plain(content), indent=1, allow_nan=False))
+    else:
+        print(render(report))
+    return 0 if report.usable else 2
+
+
+def _plain(value: Any) -> Any:
+    """NaN and infinity are no JSON: they become null."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def cli(arguments: list[str] | None = None) -> int:
+    """The command line: exit code 2 and one sentence for mistakes."""
+    import tyro
+
+    config = tyro.cli(tyro.conf.PositionalRequiredArgs[Config], args=arguments)
+    try:
+        return main(config)
+    except UserError as error:
+        if config.debug:
+            raise
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+if __name__ == "__main__":
+    sys.exit(cli())

@@ -1,0 +1,253 @@
+"""Photographs from disk: decoding without surprises, and straightening of lens distortion.
+
+Every picture comes out as float32 RGB [h, w, 3] in [0, 1], sRGB. What cannot be read that way (HDR,
+CMYK without a profile, damaged files) is refused with the file's name, never guessed.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.errors import UserError
+from roge_jax.geometry.crops import shift_K
+
+HDR = (".exr", ".hdr", ".pfm")
+EXIF_ORIENTATION = 0x0112
+# EXIF orientation -> quarter turns counter-clockwise from the stored to the displayed picture.
+QUARTER_TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
+
+
+@dataclasses.dataclass(frozen=True)
+class Header:
+    """What a file says before its pixels are decoded; sizes are (height, width)."""
+
+    stored: tuple[int, int]
+    orientation: int
+    alpha: bool
+    mode: str
+
+    @property
+    def displayed(self) -> tuple[int, int]:
+        """The size after the EXIF orientation is applied."""
+        return self.stored[::-1] if self.orientation >= 5 else self.stored
+
+
+@dataclasses.dataclass(frozen=True)
+class Lens:
+    """Distortion of a lens: model "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (k1..k4)."""
+
+    model: str
+    coefficients: tuple[float, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """One posed photo as a reader found it.
+
+    K [3, 3] is in pixels of a picture of `size` (height, width); None: of the file as it is, (1, 1)
+    : normalised by width and height. c2w [4, 4] has OpenCV axes.
+    """
+
+    file: Path
+    K: np.ndarray
+    c2w: np.ndarray
+    size: tuple[int, int] | None = None
+    lens: Lens | None = None
+
+
+def read_header(file: Path) -> Header:
+    """Size, orientation and mode of a picture. Raises UserError if the file is missing or alien."""
+    from PIL import Image
+
+    if file.suffix.lower() in HDR:
+        raise UserError(
+            f"{file}: HDR pictures have no fixed white: tone-map it to an 8 or 16 bit PNG first."
+        )
+    try:
+        with Image.open(file) as picture:
+            orientation = int(picture.getexif().get(EXIF_ORIENTATION, 1))
+            bands = picture.getbands()
+            alpha = "A" in bands or "a" in bands or "transparency" in picture.info
+            mode = picture.mode
+            size = (picture.height, picture.width)
+    except FileNotFoundError:
+        raise UserError(f"{file}: there is no such picture.") from None
+    except Exception as error:
+        raise UserError(f"{file}: not a readable picture ({error}).") from None
+    return Header(size, orientation if 1 <= orientation <= 8 else 1, alpha, mode)
+
+
+def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.ndarray:
+    """A photo as float32 RGB [h, w, 3] in [0, 1].
+
+    Args:
+      file: 8 or 16 bit PNG, JPEG, WebP, TIFF ... 16 bits are divided by 65535.
+      background: what transparent pixels show (white as in comparable projects).
+      exif: turn the picture as its EXIF orientation says; False keeps the stored grid.
+    Raises: UserError for missing, damaged, HDR, floating point or profile-less CMYK files.
+    """
+    from PIL import Image, ImageOps
+
+    header = read_header(file)
+    try:
+        if _is_deep(file):
+            pixels = _read_deep(file)
+            pixels = _upright(pixels, header.orientation) if exif else pixels
+        else:
+            with Image.open(file) as picture:
+                picture.load()
+                shown = ImageOps.exif_transpose(picture) if exif else picture
+                shown.info = picture.info
+                pixels = np.asarray(_to_rgb(shown, file), np.float32) / np.float32(255)
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(f"{file}: damaged or truncated picture ({error}).") from None
+    if pixels.shape[-1] == 4:
+        alpha = pixels[..., 3:]
+        pixels = pixels[..., :3] * alpha + np.float32(background) * (1 - alpha)
+    return np.ascontiguousarray(pixels, np.float32)
+
+
+def _is_deep(file: Path) -> bool:
+    """Whether Pillow would cut the file to 8 bits: 16 bit PNG, or TIFF."""
+    if file.suffix.lower() in (".tif", ".tiff"):
+        return True
+    with file.open("rb") as stream:
+        start = stream.read(25)
+    return start.startswith(b"\x89PNG") and len(start) == 25 and start[24] == 16
+
+
+def _read_deep(file: Path) -> np.ndarray:
+    """8 or 16 bits per channel to float32 [h, w, 3 or 4]."""
+    try:
+        import cv2
+    except ImportError:
+        raise UserError(f"{file}: needs OpenCV to be read: pip install opencv-python.") from None
+    pixels = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise UserError(f"{file}: damaged or truncated picture.")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise UserError(f"{file}: {pixels.dtype} pixels: convert it to an 8 or 16 bit PNG first.")
+    pixels = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    pixels = pixels[..., None] if pixels.ndim == 2 else pixels
+    if pixels.shape[-1] == 1:
+        return np.repeat(pixels, 3, -1)
+    return pixels[..., [2, 1, 0, *range(3, pixels.shape[-1])]]
+
+
+def _to_rgb(picture: Any, file: Path) -> Any:
+    """An 8 bit Pillow picture of any mode as RGB or (straight alpha) RGBA in sRGB."""
+    import io
+
+    from PIL import ImageCms
+
+    profile = picture.info.get("icc_profile")
+    if picture.mode == "CMYK" and not profile:
+        raise UserError(f"{file}: CMYK without a colour profile: convert it to sRGB first.")
+    if picture.mode in ("F", "I", "I;16", "I;16B", "I;16L"):
+        raise UserError(f"{file}: pixel mode {picture.mode}: convert it to an 8 or 16 bit PNG.")
+    if profile and picture.mode in ("RGB", "CMYK"):
+        try:
+            source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            return ImageCms.profileToProfile(
+                picture, source, ImageCms.createProfile("sRGB"), outputMode="RGB"
+            )
+        except ImageCms.PyCMSError:
+            if picture.mode == "CMYK":
+                raise UserError(f"{file}: its colour profile is broken: convert it.") from None
+    if picture.mode in ("LA", "La", "PA", "RGBa", "RGBA") or "transparency" in picture.info:
+        return picture.convert("RGBa" if picture.mode == "La" else "RGBA").convert("RGBA")
+    return picture.convert("RGB")
+
+
+def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """Stored [h, w, c] to displayed, for the EXIF orientations 1..8."""
+    mirrored = {2: (0, True), 4: (2, True), 5: (3, True), 7: (1, True)}
+    turns, flip = mirrored.get(orientation, (QUARTER_TURNS.get(orientation, 0), False))
+    return np.rot90(pixels[:, ::-1] if flip else pixels, turns)
+
+
+def ideal_K(K: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
+    """K [3, 3] of the straightened picture of the same size: no empty border, little cut away."""
+    cv2 = _opencv_for_lens()
+    height, width = size
+    centred = shift_K(K, 0.5, 0.5)  # OpenCV's pixel centres are whole numbers
+    if lens.model == "fisheye":
+        k = np.array(lens.coefficients, np.float64)[:4]
+        new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            centred, k, (width, height), np.eye(3), balance=0.0
+        )
+    else:
+        k = np.array(lens.coefficients, np.float64)
+        new, _ = cv2.getOptimalNewCameraMatrix(centred, k, (width, height), 0)
+    return shift_K(np.asarray(new, np.float64), -0.5, -0.5)
+
+
+def undistort(image: np.ndarray, K: np.ndarray, lens: Lens, new_K: np.ndarray) -> np.ndarray:
+    """The picture [h, w, 3] that a pinhole camera with `new_K` would have taken."""
+    cv2 = _opencv_for_lens()
+    size = (image.shape[1], image.shape[0])
+    old, new = shift_K(K, 0.5, 0.5), shift_K(new_K, 0.5, 0.5)
+    k = np.array(lens.coefficients, np.float64)
+    make = cv2.initUndistortRectifyMap
+    if lens.model == "fisheye":
+        make, k = cv2.fisheye.initUndistortRectifyMap, k[:4]
+    across, down = make(old, k, np.eye(3), new, size, cv2.CV_32FC1)
+    return cv2.remap(image, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _opencv_for_lens() -> Any:
+    try:
+        import cv2
+    except ImportError:
+        raise UserError(
+            "Lens distortion needs OpenCV: pip install opencv-python, or give undistorted photos."
+        ) from None
+    return cv2
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """How one file becomes the picture that its camera describes."""
+
+    file: Path
+    size: tuple[int, int]  # of the result
+    exif: bool = True
+    quarter_turns: int = 0  # after decoding and straightening
+    lens: Lens | None = None
+    K: np.ndarray | None = None  # of the decoded picture, for the lens
+    new_K: np.ndarray | None = None
+    background: float = 1.0
+
+    def read(self) -> np.ndarray:
+        """float32 [h, w, 3] in [0, 1]."""
+        image = read_image(self.file, background=self.background, exif=self.exif)
+        if self.lens is not None:
+            assert self.K is not None and self.new_K is not None
+            image = np.clip(undistort(image, self.K, self.lens, self.new_K), 0.0, 1.0)
+        return np.ascontiguousarray(np.rot90(image, self.quarter_turns))
+
+
+class Photos(Sequence):
+    """The photos of a scene, decoded when they are asked for."""
+
+    def __init__(self, photos: Sequence[Photo]):
+        self.photos = list(photos)
+
+    def __len__(self) -> int:
+        return len(self.photos)
+
+    def __getitem__(self, index: Any) -> Any:
+        """float32 [h, w, 3] for a number; a slice of `Photos` for a slice."""
+        if isinstance(index, slice):
+            return Photos(self.photos[index])
+        return self.photos[index].read()
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of every photo, without decoding."""
+        return [photo.size for photo in self.photos]

@@ -1,0 +1,329 @@
+"""A scene: posed photographs, from a folder or built in, ready for the model."""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.data.images import (
+    QUARTER_TURNS,
+    Frame,
+    Header,
+    Photo,
+    Photos,
+    ideal_K,
+    read_header,
+)
+from roge_jax.data.readers import read_frames
+from roge_jax.errors import UserError, did_you_mean
+from roge_jax.geometry.cameras import (
+    Cameras,
+    CameraWarning,
+    crop_resize,
+    scale_K,
+    to_host,
+    turn,
+    validate,
+)
+from roge_jax.geometry.validation import Finding
+
+__all__ = ["Scene", "distinct_views", "load_scene", "open_scene", "prepare", "select_context"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Posed photos. Cameras are float64 NumPy, OpenCV camera-to-world, K in pixels of its photo.
+
+    images: a sequence of float32 RGB [h, w, 3] in [0, 1], decoded on access when they are files;
+      sizes may differ. depths: z-depth [h, w] per view in the scene's unit where it is known, NaN
+      where it is not. notes: what reading changed or assumed, as findings.
+    """
+
+    images: Sequence[np.ndarray]
+    cameras: Cameras
+    names: tuple[str, ...]
+    source: str
+    depths: Sequence[np.ndarray] | None = None
+    notes: tuple[Finding, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of every photo, without decoding files."""
+        if isinstance(self.images, Photos):
+            return self.images.sizes
+        return [(image.shape[0], image.shape[1]) for image in self.images]
+
+
+def load_scene(spec: str | Path, **options: Any) -> Scene:
+    """A scene whose cameras have passed `validate`.
+
+    Args:
+      spec: a folder or file in one of the layouts of `data.readers`; "motorcycle" (a real stereo
+        pair that ships with scikit-image); "procedural:SEED" (rendered).
+      options: see `open_scene`.
+    Raises: UserError naming the file, the view and the field.
+    """
+    scene = open_scene(spec, **options)
+    for note in scene.notes:
+        if note.severity == "warning":
+            warnings.warn(str(note), CameraWarning, stacklevel=2)
+    heights, widths = zip(*scene.sizes, strict=True)
+    cameras = validate(scene.cameras, heights, widths, scene.names)
+    return dataclasses.replace(scene, cameras=cameras)
+
+
+def open_scene(
+    spec: str | Path,
+    *,
+    convention: str | None = None,
+    exif: str = "auto",
+    background: float = 1.0,
+    camera: int = 0,
+    frames: int = 32,
+    height: int = 192,
+    width: int = 336,
+    supersample: int = 2,
+) -> Scene:
+    """A scene as it is, its cameras unchecked (`check` uses this to report all that is wrong).
+
+    Args:
+      convention: axes of the poses of a `transforms.json` if they are not OpenGL.
+      exif: "auto" turns photos upright as their EXIF tag says (poses and K too, if K is plainly for
+        the stored grid), "ignore" takes the stored grid.
+      background: what transparent pixels show, 1 is white.
+      camera: which of Virtual KITTI 2's two cameras.
+      frames, height, width, supersample: of procedural scenes.
+    """
+    name = str(spec)
+    if name == "motorcycle":
+        return _motorcycle()
+    if name.startswith("procedural:"):
+        return _procedural(name, frames, height, width, supersample)
+    if not Path(spec).exists() and "/" not in name and "." not in name:
+        hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
+        raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
+    if exif not in ("auto", "ignore"):
+        raise UserError(f"exif='{exif}': {did_you_mean(exif, ('auto', 'ignore'))}")
+    found = read_frames(Path(spec), convention=convention, camera=camera)
+    return _assemble(found, name, exif, background)
+
+
+def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:
+    """Frames to a scene: sizes, orientation, scale of K, lens. Pixels are not decoded yet."""
+    photos, Ks, poses = [], [], []
+    notes: dict[str, Finding] = {}
+
+    def note(severity: str, what: str, fix: str) -> None:
+        notes.setdefault(what, Finding(severity, source, what, fix))
+
+    for frame in frames:
+        header = read_header(frame.file)
+        if header.alpha:
+            note("warning", "photos are transparent", f"they show background {background:g} there")
+        use_tag, turns = _orientation(header, frame, exif)
+        if header.orientation != 1:
+            note("note", "photos carry an EXIF orientation", "see docs/cameras.md if they lie down")
+        size = header.displayed if use_tag else header.stored
+        K = _fit_K(frame, size)
+        if frame.size not in (None, size, (1, 1)):
+            what = f"intrinsics are for {frame.size[1]} x {frame.size[0]} pixels"
+            note("note", what, f"they are scaled to the photos, {size[1]} x {size[0]}")
+        lens, new_K = frame.lens, None
+        pose = frame.c2w
+        turned, upright = K, size
+        if lens is not None and np.isfinite(K).all():
+            turned = new_K = ideal_K(K, lens, size)
+            note("note", f"photos have {lens.model} lens distortion", "it is removed")
+        if turns:
+            turned, pose = turn(turned, pose, turns, *size)
+            upright = size[::-1] if turns % 2 else size
+        lens_K = None if new_K is None else K
+        lens = None if new_K is None else lens
+        photos.append(Photo(frame.file, upright, use_tag, turns, lens, lens_K, new_K, background))
+        Ks.append(turned)
+        poses.append(pose)
+    names = tuple(frame.file.name for frame in frames)
+    cameras = Cameras(np.stack(Ks), np.stack(poses))
+    return Scene(Photos(photos), cameras, names, source, notes=tuple(notes.values()))
+
+
+def _orientation(header: Header, frame: Frame, exif: str) -> tuple[bool, int]:
+    """(apply the EXIF tag while decoding, quarter turns of picture and camera afterwards).
+
+    K is taken to be for the upright picture unless its size fits only the stored grid; then the
+    poses belong to that grid too, and picture, K and pose are turned together.
+    """
+    if exif == "ignore":
+        return False, 0
+    if frame.size in (None, (1, 1)) or header.orientation < 5:
+        return True, 0
+    assert frame.size is not None
+    height, width = frame.size
+    for_stored = _aspect_gap((height, width), header.stored) < 0.02
+    for_upright = _aspect_gap((height, width), header.displayed) < 0.02
+    if for_upright or not for_stored:
+        return True, 0
+    # A mirrored picture (5, 7) is no camera's picture: it stays on its grid.
+    return False, QUARTER_TURNS.get(header.orientation, 0)
+
+
+def _aspect_gap(a: tuple[int, int], b: tuple[int, int]) -> float:
+    return abs((a[1] / a[0]) / (b[1] / b[0]) - 1.0)
+
+
+def _fit_K(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """K in pixels of the picture of this size, whatever size the file says it is for."""
+    if frame.size is None or frame.size == size:
+        return frame.K
+    if frame.size != (1, 1) and _aspect_gap(frame.size, size) > 0.02:
+        raise UserError(
+            f"{frame.file}: is {size[1]} x {size[0]} pixels but its intrinsics are for "
+            f"{frame.size[1]} x {frame.size[0]}: correct 'w' and 'h', or do not crop the photo."
+        )
+    return scale_K(frame.K, frame.size, size)
+
+
+def _motorcycle() -> Scene:
+    """Middlebury 2014 "Motorcycle", quarter size: two photos 193.001 mm apart, world in metres.
+
+    Calibration from scikit-image's documentation. Middlebury counts pixel centres as whole numbers
+    at full size, so the principal point moves by (0.5 px) / 4. The right camera's principal point
+    lies 31.086 px further right; z-depth = focal * baseline / (disparity + 31.086).
+    """
+    from skimage import data
+
+    left, right, disparity = data.stereo_motorcycle()
+    focal, cx, cy, dx, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
+    K = np.array([[focal, 0.0, cx + 0.125], [0.0, focal, cy + 0.125], [0.0, 0.0, 1.0]])
+    second = K.copy()
+    second[0, 2] += dx
+    c2w = np.tile(np.eye(4), (2, 1, 1))
+    c2w[1, 0, 3] = baseline
+    disparity = np.where(np.isfinite(disparity), disparity, np.nan).astype(np.float64)
+    depth = (focal * baseline / (disparity + dx)).astype(np.float32)
+    images = [np.asarray(image, np.float32) / np.float32(255) for image in (left, right)]
+    unknown = np.full_like(depth, np.nan)
+    cameras = Cameras(np.stack([K, second]), c2w)
+    return Scene(images, cameras, ("left", "right"), "motorcycle", depths=[depth, unknown])
+
+
+def _procedural(name: str, frames: int, height: int, width: int, supersample: int) -> Scene:
+    from roge_jax.data import procedural
+
+    try:
+        seed = int(name.removeprefix("procedural:"))
+    except ValueError:
+        raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.") from None
+    made = procedural.sample_sequence(
+        seed, frames=frames, height=height, width=width, supersample=supersample
+    )
+    images = [np.asarray(image, np.float32) / np.float32(255) for image in np.asarray(made["rgb"])]
+    names = tuple(f"{i:04d}" for i in range(len(images)))
+    cameras = to_host(Cameras(made["K"], made["c2w"]))
+    return Scene(images, cameras, names, name, depths=list(np.asarray(made["depth"])))
+
+
+def prepare(
+    scene: Scene,
+    ids: Sequence[int],
+    height: int,
+    width: int,
+    *,
+    drop_duplicates: bool = True,
+) -> tuple[np.ndarray, Cameras]:
+    """Views of a scene at one size: images float32 [k, height, width, 3], cameras with K to match.
+
+    Every photo fills the picture and is cropped at the centre; K moves along. A view given twice
+    (same pose and pixels) is kept once, with a CameraWarning.
+    Raises: UserError for views that do not exist, and for photos whose aspect ratios differ by more
+      than a factor of two (one crop would show what the other lacks).
+    """
+    ids = [int(i) for i in ids]
+    for i in ids:
+        if not 0 <= i < len(scene):
+            raise UserError(f"{scene.source}: there is no view {i}: it has {len(scene)}, from 0.")
+    if not ids:
+        raise UserError(f"{scene.source}: no views were chosen: give at least one.")
+    aspects = [scene.sizes[i][1] / scene.sizes[i][0] for i in ids]
+    if max(aspects) > 2 * min(aspects):
+        wide, tall = ids[int(np.argmax(aspects))], ids[int(np.argmin(aspects))]
+        raise UserError(
+            f"{scene.source}: photos {scene.names[wide]} and {scene.names[tall]} differ by more "
+            "than a factor of two in aspect ratio: crop them alike, or choose other views."
+        )
+    images, Ks = [], []
+    for i in ids:
+        image, K = crop_resize(scene.images[i], scene.cameras.K[i], height, width)
+        images.append(image)
+        Ks.append(K)
+    pictures, cameras = np.stack(images), Cameras(np.stack(Ks), scene.cameras.c2w[ids])
+    if drop_duplicates:
+        kept = distinct_views(pictures, cameras)
+        if len(kept) < len(ids):
+            gone = [scene.names[ids[i]] for i in range(len(ids)) if i not in kept]
+            message = f"{scene.source}: same pose and picture as another view: {', '.join(gone)}."
+            warnings.warn(message, CameraWarning, stacklevel=2)
+            pictures, cameras = pictures[kept], cameras[kept]
+    return pictures, cameras
+
+
+def distinct_views(images: Sequence[np.ndarray], cameras: Cameras) -> list[int]:
+    """Indices of the views left when of views with equal pose, K and pixels the first is kept."""
+    cameras = to_host(cameras)
+    kept: list[int] = []
+    for view in range(len(cameras)):
+        same = (
+            other
+            for other in kept
+            if np.array_equal(cameras.c2w[view], cameras.c2w[other])
+            and np.array_equal(cameras.K[view], cameras.K[other])
+            and np.array_equal(images[view], images[other])
+        )
+        if next(same, None) is None:
+            kept.append(view)
+    return kept
+
+
+def select_context(
+    scene: Scene | Cameras, m: int, *, first: int | None = None, among: Sequence[int] | None = None
+) -> list[int]:
+    """m views that see as much of the scene as possible: farthest-point sampling, deterministic.
+
+    The distance of two views is their distance over the largest one, and their angle over the
+    largest one, added in squares, so it depends on no unit. The first view is the most central one
+    unless `first` is given. `among` limits the choice. Returns indices in ascending order, except
+    that `first` leads (it becomes the world frame).
+    """
+    cameras = to_host(scene.cameras if isinstance(scene, Scene) else scene)
+    pool = list(range(len(cameras))) if among is None else [int(i) for i in among]
+    if not 1 <= m <= len(pool):
+        raise UserError(f"Cannot choose {m} context views: the scene offers 1 to {len(pool)}.")
+    if first is not None and first not in pool:
+        raise UserError(f"View {first} cannot be the first context: it is not among the choices.")
+    chosen = cameras[pool]
+    apart = np.linalg.norm(chosen.centres[:, None] - chosen.centres[None], axis=-1)
+    rotations = chosen.c2w[:, :3, :3]
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    angles = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
+    # What is only rounding (of positions, and of arccos near 1) must not be scaled up to 1.
+    limits = (1e-12 * np.abs(chosen.centres).max(), 1e-6)
+    distances = np.sqrt(
+        sum(
+            (gap / gap.max()) ** 2 if gap.max() > limit else 0.0 * gap
+            for gap, limit in zip((apart, angles), limits, strict=True)
+        )
+    )
+    start = int(np.argmin(distances.sum(0))) if first is None else pool.index(first)
+    picked = [start]
+    while len(picked) < m:
+        nearest = distances[:, picked].min(1)
+        nearest[picked] = -1.0
+        picked.append(int(np.argmax(nearest)))
+    ids = sorted(pool[i] for i in picked)
+    return ids if first is None else [first, *(i for i in ids if i != first)]
