@@ -13,8 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from roge_jax.video.solvers import BAD_STATE, BAD_VELOCITY, FINE, OUT_OF_BUDGET, SolveInfo
-from roge_jax.video.solvers import _fresh_info, _note
+from roge_jax.video.solve_info import (
+    BAD_STATE,
+    BAD_VELOCITY,
+    FINE,
+    OUT_OF_BUDGET,
+    SolveInfo,
+    fresh_info,
+    note,
+)
 
 # Bogacki and Shampine 1989: stage s looks at y + h sum_j A[s, j] k_j; the last row is the step
 A = np.array([[0, 0, 0, 0], [1 / 2, 0, 0, 0], [0, 3 / 4, 0, 0], [2 / 9, 1 / 3, 4 / 9, 0]])
@@ -80,10 +87,10 @@ def solve_bosh3(
         at_end = (s.stage == 3) & lands & (s.piece < len(inner))
         looked = jnp.where((s.stage == 0) & s.fresh, below, jnp.where(at_end, above, sigma))
         x = project(x, looked).astype(dtype)
-        info = _note(s.info, x, BAD_STATE, s.taken, looked)
+        info = note(s.info, x, BAD_STATE, s.taken, looked)
         info = info.replace(evaluations=info.evaluations + 1)
         v = velocity(x, looked).astype(dtype)
-        info = _note(info, v, BAD_VELOCITY, s.taken, looked)
+        info = note(info, v, BAD_VELOCITY, s.taken, looked)
         slopes = jax.lax.dynamic_update_index_in_dim(s.slopes, v, s.stage, 0)
 
         weights = err_weights.reshape((4,) + (1,) * s.x.ndim)
@@ -131,7 +138,7 @@ def solve_bosh3(
         fresh=jnp.asarray(False),
         error=jnp.ones((), dtype),
         taken=zero,
-        info=_fresh_info(x1.size, dtype),
+        info=fresh_info(x1.size, dtype),
     )
     end = jax.lax.while_loop(running, body, state)
     if not to_zero:
@@ -142,9 +149,9 @@ def solve_bosh3(
     def last() -> tuple[Array, SolveInfo]:
         v = velocity(x, end.sigma).astype(dtype)
         info = end.info.replace(evaluations=end.info.evaluations + 1)
-        info = _note(info, v, BAD_VELOCITY, end.taken, end.sigma)
+        info = note(info, v, BAD_VELOCITY, end.taken, end.sigma)
         return jnp.where(info.failed, x, x - end.sigma * v), info
 
     x0, info = jax.lax.cond(end.info.failed, lambda: (x, end.info), last)
     x0 = project(x0, jnp.zeros((), dtype)).astype(dtype)
-    return x0, _note(info, x0, BAD_STATE, info.step, jnp.zeros((), dtype))
+    return x0, note(info, x0, BAD_STATE, info.step, jnp.zeros((), dtype))

@@ -16,10 +16,19 @@ from collections.abc import Callable, Iterator, Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 
 from roge_jax.errors import UserError
+from roge_jax.video.adaptive import solve_bosh3
+from roge_jax.video.solve_info import (
+    BAD_STATE,
+    BAD_VELOCITY,
+    SamplingError,
+    SolveInfo,
+    fresh_info,
+    note,
+    raise_if_failed,
+)
 from roge_jax.video.solver_table import SOLVERS, Table, check_grid, nfe, tabulate
 
 __all__ = [
@@ -31,54 +40,13 @@ __all__ = [
     "guided",
     "iterate",
     "nfe",
+    "raise_if_failed",
+    "solve",
+    "tabulate",
 ]
-__all__ += ["raise_if_failed", "solve", "tabulate"]
 
 Velocity = Callable[[Array, Array], Array]
 Project = Callable[[Array, Array], Array]
-
-FINE, BAD_VELOCITY, BAD_STATE, OUT_OF_BUDGET = range(4)
-
-
-class SamplingError(RuntimeError):
-    """The sampler stopped early; the message says at which step, noise level and tensor."""
-
-
-@struct.dataclass
-class SolveInfo:
-    """What happened on the way; all scalars but `states`."""
-
-    evaluations: Array  # velocity evaluations made, int32
-    rejected: Array  # evaluations thrown away by step control, int32 (0 on a fixed grid)
-    cause: Array  # FINE, BAD_VELOCITY, BAD_STATE or OUT_OF_BUDGET, int32
-    step: Array  # step of the failure, int32, -1 if fine
-    sigma: Array  # noise level of the failure
-    bad: Array  # non-finite numbers found there, int32
-    size: Array  # numbers in the state, int32
-    states: Array | None = None  # [n + 1, ...] the state at each grid point, if asked for
-
-    @property
-    def failed(self) -> Array:
-        return self.cause != FINE
-
-
-def raise_if_failed(info: SolveInfo) -> None:
-    """Raise SamplingError naming step, sigma and tensor. Call it outside jit."""
-    cause = int(info.cause)
-    if cause == FINE:
-        return
-    where = f"step {int(info.step)}, sigma {float(info.sigma):.6g}"
-    if cause == OUT_OF_BUDGET:
-        raise SamplingError(
-            f"The adaptive solver used all its {int(info.evaluations)} evaluations and stands at {where} "
-            f"({int(info.rejected)} rejected). Allow more, loosen the tolerance, or name the noise "
-            "levels where the field jumps in `breaks`."
-        )
-    tensor = "velocity (the network's output)" if cause == BAD_VELOCITY else "state"
-    raise SamplingError(
-        f"The {tensor} is not finite at {where}: {int(info.bad)} of {int(info.size)} numbers. Sampling "
-        f"stopped after {int(info.evaluations)} evaluations."
-    )
 
 
 def guided(
@@ -137,8 +105,6 @@ def solve(
     """
     dtype = jnp.promote_types(x1.dtype, jnp.float32) if state_dtype is None else state_dtype
     if isinstance(solver, str) and solver in SOLVERS and SOLVERS[solver].method is None:
-        from roge_jax.video.adaptive import solve_bosh3  # adaptive.py imports this module
-
         assert sigmas is not None and not keep_states
         x, info = solve_bosh3(
             velocity,
@@ -159,10 +125,10 @@ def solve(
         return (stored, info), (x if keep_states else None)
 
     rows = _rows(table)
-    (stored, info), seen = jax.lax.scan(body, (stored, _fresh_info(x1.size, dtype)), rows)
+    (stored, info), seen = jax.lax.scan(body, (stored, fresh_info(x1.size, dtype)), rows)
     end = jnp.asarray(table.grid, jnp.promote_types(dtype, jnp.float32))[-1]
     x0 = stored[0] if project is None else project(stored[0], end).astype(dtype)
-    info = _note(info, x0, BAD_STATE, len(table.grid) - 1, end)
+    info = note(info, x0, BAD_STATE, len(table.grid) - 1, end)
     if keep_states:
         info = info.replace(states=jnp.concatenate([seen[table.first], x0[None]]))
     return x0, info
@@ -185,15 +151,15 @@ def iterate(
     table = _table(solver, sigmas, breaks)
     dtype = jnp.promote_types(x1.dtype, jnp.float32)
     stored = _start(table, x1.astype(dtype))
-    info, rows = _fresh_info(x1.size, dtype), _rows(table)
+    info, rows = fresh_info(x1.size, dtype), _rows(table)
     count = len(table.sigma)
     for e in range(count):
         row = jax.tree.map(lambda leaf, e=e: leaf[e], rows)
         x, sigma = _look(stored[0], project, row)
-        info = _note(info, x, BAD_STATE, row["step"], sigma)
+        info = note(info, x, BAD_STATE, row["step"], sigma)
         raise_if_failed(info)
         v = velocity(x, sigma)
-        info = _note(
+        info = note(
             info.replace(evaluations=info.evaluations + 1), v, BAD_VELOCITY, row["step"], sigma
         )
         raise_if_failed(info)
@@ -201,7 +167,7 @@ def iterate(
         yield e + 1, count, stored[0]
     end = jnp.asarray(table.grid[-1], stored.dtype)
     x0 = stored[0] if project is None else project(stored[0], end)
-    raise_if_failed(_note(info, x0, BAD_STATE, len(table.grid) - 1, end))
+    raise_if_failed(note(info, x0, BAD_STATE, len(table.grid) - 1, end))
     if project is not None:
         yield count, count, x0
 
@@ -227,25 +193,6 @@ def _start(table: Table, x1: Array) -> Array:
 def _rows(table: Table) -> dict[str, Array]:
     names = ("sigma", "side", "step", "mix")
     return {name: jnp.asarray(getattr(table, name)) for name in names}
-
-
-def _fresh_info(size: int, dtype) -> SolveInfo:
-    zero = jnp.int32(0)
-    sigma = jnp.zeros((), jnp.promote_types(dtype, jnp.float32))
-    return SolveInfo(zero, zero, jnp.int32(FINE), jnp.int32(-1), sigma, zero, jnp.int32(size))
-
-
-def _note(info: SolveInfo, x: Array, cause: int, step, sigma: Array) -> SolveInfo:
-    """Record the first failure: `x` holds numbers that are not finite."""
-    bad = jnp.sum(~jnp.isfinite(x), dtype=jnp.int32)
-    new = (bad > 0) & (info.cause == FINE)
-    pick = lambda now, old: jnp.where(new, jnp.asarray(now, old.dtype), old)  # noqa: E731
-    return info.replace(
-        cause=pick(cause, info.cause),
-        step=pick(step, info.step),
-        sigma=pick(sigma, info.sigma),
-        bad=pick(bad, info.bad),
-    )
 
 
 def _look(x: Array, project: Project | None, row: dict[str, Array]) -> tuple[Array, Array]:
@@ -282,12 +229,12 @@ def _evaluate(
 ) -> tuple[Array, SolveInfo, Array]:
     """One row of the table. After a failure nothing moves and the network is not called."""
     x, sigma = _look(stored[0], project, row)
-    info = _note(info, x, BAD_STATE, row["step"], sigma)
+    info = note(info, x, BAD_STATE, row["step"], sigma)
 
     def call() -> tuple[Array, SolveInfo]:
         v = velocity(x, sigma)
         after = info.replace(evaluations=info.evaluations + 1)
-        after = _note(after, v, BAD_VELOCITY, row["step"], sigma)
+        after = note(after, v, BAD_VELOCITY, row["step"], sigma)
         mixed = _mix(row["mix"], stored, v)
         return jnp.where(after.failed, stored, mixed), after
 
