@@ -1,0 +1,104 @@
+"""From posed sequences to training samples: which views are contexts, which are targets, and how they are altered.
+
+A sample is a pure function of (seed, index), so a training run that restarts sees the same data.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.cameras import Cameras, camera_vector, normalise
+
+
+@dataclass(frozen=True)
+class ViewConfig:
+    """How training samples are drawn from a sequence."""
+
+    contexts: tuple[int, ...] = (1, 2, 3, 4)
+    context_weights: tuple[float, ...] = (0.1, 0.25, 0.4, 0.25)
+    targets: int = 8
+    ordered: bool = False  # targets are a contiguous run of frames (video), else any frames
+    outside: float = 0.2  # probability that contexts surround the window instead of lying in it
+    near: float = 0.4  # probability of drawing all views from a short stretch of the path
+    augment: bool = True
+
+
+def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):
+    """Indices of `m` contexts (shuffled) and of the targets, in a sequence of `frames` frames."""
+    n = cfg.targets
+    if not cfg.ordered:
+        span = frames
+        if rng.random() < cfg.near:
+            span = int(rng.integers(min(frames, max(m + 2, 5)), max(frames // 2, m + 3) + 1))
+        start = int(rng.integers(0, frames - span + 1))
+        contexts = start + rng.choice(span, m, replace=False)
+        targets = start + rng.choice(span, n, replace=span < n)
+        return contexts, targets
+    start = int(rng.integers(0, frames - n + 1))
+    window = np.arange(start, start + n)
+    around = np.setdiff1d(np.arange(frames), window)
+    if rng.random() < cfg.outside and len(around) >= m:
+        contexts = rng.choice(around, m, replace=False)
+    else:  # stratified over the window, with jitter
+        edges = np.linspace(0, n, m + 1)
+        contexts = start + np.floor(rng.uniform(edges[:-1], edges[1:])).astype(int)
+        rng.shuffle(contexts)
+    return contexts, window if rng.random() < 0.5 else window[::-1]
+
+
+def alter(rng: np.random.Generator, rgb: np.ndarray, K: np.ndarray, c2w: np.ndarray):
+    """One random mirror, colour permutation, inversion, gamma and saturation for all views of a sample.
+
+    rgb [v, h, w, 3] in [0, 1]. A mirrored scene is a valid scene: pixels flip, cx moves, and the poses are
+    conjugated by diag(-1, 1, 1, 1), which keeps det R = +1.
+    """
+    if rng.random() < 0.5:
+        rgb = rgb[:, :, ::-1]
+        flip = np.diag([-1.0, 1.0, 1.0, 1.0])
+        c2w, K = flip @ c2w @ flip, K.copy()
+        K[:, 0, 2] = rgb.shape[2] - K[:, 0, 2]
+    if rng.random() < 0.5:
+        rgb = rgb[..., rng.permutation(3)]
+    if rng.random() < 0.2:
+        rgb = 1.0 - rgb
+    grey = rgb.mean(-1, keepdims=True)
+    rgb = grey + rng.uniform(0.3, 1.2) * (rgb - grey)
+    return np.clip(rgb, 0.0, 1.0) ** rng.uniform(0.7, 1.4), K, c2w
+
+
+def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray]:
+    """Views [m + n] (contexts first) as the arrays the model takes, normalised to the first context.
+
+    Returns context_rgb [m, h, w, 3], target_rgb [n, h, w, 3] float32 in [0, 1], K [m + n, 3, 3] in pixels,
+    c2w [m + n, 4, 4], vectors [m, 11].
+    """
+    h, w = rgb.shape[1:3]
+    context, target, info = normalise(Cameras(K[:m], c2w[:m]), Cameras(K[m:], c2w[m:]), rule=scale_rule)
+    return {
+        "context_rgb": rgb[:m].astype(np.float32),
+        "target_rgb": rgb[m:].astype(np.float32),
+        "K": np.concatenate([context.K, target.K]).astype(np.float32),
+        "c2w": np.concatenate([context.c2w, target.c2w]).astype(np.float32),
+        "vectors": np.asarray(camera_vector(context, h, w, info.camera_scale, info.points_flag)),
+    }
+
+
+def draw_batch(pool, seed: int, index: int, batch: int, cfg: ViewConfig, *, scale_rule: str) -> dict:
+    """Batch number `index`: arrays of `make_sample` with a leading batch axis; one M for the whole batch.
+
+    `pool` has `rgb` [s, f, h, w, 3] uint8, `K` [s, f, 3, 3] and `c2w` [s, f, 4, 4].
+    """
+    rng = np.random.default_rng([seed, index])
+    weights = np.asarray(cfg.context_weights) / sum(cfg.context_weights)
+    m = int(rng.choice(cfg.contexts, p=weights))
+    samples = []
+    for _ in range(batch):
+        scene = int(rng.integers(len(pool.rgb)))
+        contexts, targets = draw_views(rng, pool.rgb.shape[1], m, cfg)
+        views = np.concatenate([contexts, targets])
+        rgb = pool.rgb[scene][views].astype(np.float32) / 255.0
+        K, c2w = np.asarray(pool.K[scene][views], np.float64), np.asarray(pool.c2w[scene][views], np.float64)
+        if cfg.augment:
+            rgb, K, c2w = alter(rng, rgb, K, c2w)
+        samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))
+    return {name: np.stack([s[name] for s in samples]) for name in samples[0]}

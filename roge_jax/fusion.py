@@ -1,0 +1,77 @@
+"""Reconstruction-generation fusion (Sec. 3.2 of the paper): hybrid latents, appearance, rays and geometry.
+
+Latent slots are ordered contexts first: one slot per context photo, then those of the target video.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .config import RoGeConfig
+from .core.layers import linear, linear_specs, patch_conv, patch_conv_specs
+from .core.params import Tree, zeros
+from .geometry.packing import pack_views, pixel_unshuffle
+
+MASK_CHANNELS = 4
+
+
+class Condition(NamedTuple):
+    """What the transformer knows besides the noisy latents: the same at every noise level.
+
+    appearance: [t, lh, lw, 20] = [mask 4, context latents or zeros 16]; tokens: [l, d], the sum of the embedded rays
+    and ray features.
+    """
+
+    appearance: jax.Array
+    tokens: jax.Array
+
+
+def fusion_specs(config: RoGeConfig) -> Tree:
+    """The geometry adapter (random) and the two new patch embeddings (zero: step 0 is the pretrained model)."""
+    c, d, patch = config.fusion.geometry_channels, config.dit.width, config.dit.patch
+    return {
+        "geometry_adapter": linear_specs(config.renderer.width, c, ("embed", None)),
+        "rays_embed": patch_conv_specs(patch, 6 * 4 * 64, d, init=zeros),
+        "geometry_embed": patch_conv_specs(patch, 4 * c, d, init=zeros),
+    }
+
+
+def appearance(context_latents: jax.Array, slots: int) -> jax.Array:
+    """Y = [B; [X^S, 0^T]]: context latents [m, lh, lw, 16] -> [slots, lh, lw, 20], mask channels first."""
+    m, lh, lw, c = context_latents.shape
+    mask = jnp.ones((m, lh, lw, MASK_CHANNELS))
+    known = jnp.concatenate([mask, context_latents], -1)
+    return jnp.concatenate([known, jnp.zeros((slots - m, lh, lw, MASK_CHANNELS + c))])
+
+
+def ray_condition(plucker: jax.Array, contexts: int) -> jax.Array:
+    """P: Plücker maps [m + n, h, w, 6] -> [slots, h/8, w/8, 1536], no ray is lost.
+
+    Channel = (frame of four, Plücker channel, row in block, column in block), slowest first.
+    """
+    return pack_views(pixel_unshuffle(plucker, 8), contexts)
+
+
+def geometry_condition(p: Tree, features: jax.Array, latent_size: tuple[int, int], contexts: int):
+    """G: ray features [m + n, gh, gw, d] -> [slots, lh, lw, 4C], projected, resampled, four frames to a slot."""
+    x = linear(p["geometry_adapter"], features)
+    if x.shape[1:3] != latent_size:  # bilinear, half-pixel centres, no antialiasing (as torch's interpolate)
+        x = jax.image.resize(x, (x.shape[0], *latent_size, x.shape[-1]), "bilinear", antialias=False)
+    return pack_views(x, contexts)
+
+
+def condition(
+    p: Tree, context_latents: jax.Array, plucker: jax.Array, features: jax.Array, contexts: int
+) -> Condition:
+    """All of C = {Y, P, G}; plucker [m + n, h, w, 6] at generation size, features [m + n, gh, gw, d]."""
+    rays = ray_condition(plucker, contexts)
+    geometry = geometry_condition(p, features, rays.shape[1:3], contexts)
+    tokens = patch_conv(p["rays_embed"], rays) + patch_conv(p["geometry_embed"], geometry)
+    return Condition(appearance(context_latents, rays.shape[0]), tokens.reshape(-1, tokens.shape[-1]))
+
+
+def time_index(contexts: int, slots: int) -> np.ndarray:
+    """Temporal position of every slot: 0 (no rotation) on contexts, 0..T-1 along the target trajectory."""
+    return np.concatenate([np.zeros(contexts, int), np.arange(slots - contexts)])

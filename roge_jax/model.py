@@ -1,0 +1,316 @@
+"""RoGe, top down: photos and rays to scene tokens, ray features, conditions, velocity, loss and video.
+
+Every function takes the parameter tree first and works on one scene (`jax.vmap` adds a batch axis; `loss` does so
+itself). A scene's `views` are a dict of arrays, contexts first:
+
+    context_rgb [m, h, w, 3] in [0, 1]      the photos at generation size
+    K           [m + n, 3, 3]               intrinsics in pixels of that size
+    c2w         [m + n, 4, 4]               camera-to-world, OpenCV, normalised (`geometry.cameras.normalise`)
+    vectors     [m, 11]                     `geometry.cameras.camera_vector` of the contexts
+    target_rgb  [n, h, w, 3] in [0, 1]      training only
+    context_recon, target_recon             optional: the same views at reconstruction size
+"""
+
+import re
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from . import fusion
+from .config import RoGeConfig
+from .core.lora import attach, lora_specs
+from .core.params import Spec, Tree, flatten, unflatten, zeros
+from .core.params import init as init_specs
+from .fusion import Condition
+from .geometry.rays import plucker
+from .recon import ray_scene, vggt
+from .recon.relative import Relative, relative_cameras
+from .video import dit, flow, vae
+
+ContextSlots = Literal["noised", "clean", "free"]
+Views = dict[str, jax.Array]
+
+# What trains when pretrained networks are adapted (Sec. 3.3): the new embeddings and E1 fully, the rest by LoRA.
+NEW_EMBEDDINGS = r"^fusion/|^dit/patch_embed/"
+
+
+def specs(config: RoGeConfig) -> Tree:
+    """Every leaf of the model."""
+    tree = {
+        "encoder": vggt.encoder_specs(config.encoder, config.renderer.width),
+        "renderer": ray_scene.renderer_specs(config.renderer),
+        "vae": vae.vae_specs(config.vae),
+        "dit": dit.dit_specs(config.dit),
+        "fusion": fusion.fusion_specs(config),
+    }
+    if config.dit.text_len:  # the prompt's text embedding, zero-padded: text encoders are not needed afterwards
+        shape = (config.dit.text_len, config.dit.text_dim)
+        tree["prompt"] = {"rows": Spec(shape, (None, None), zeros)}
+    return tree
+
+
+def init(key: jax.Array, config: RoGeConfig) -> Tree:
+    """Random parameters (the VAE from its pass-through initialisation)."""
+    tree = init_specs(key, {k: s for k, s in specs(config).items() if k != "vae"})
+    return tree | {"vae": vae.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
+
+
+def adapter_specs(config: RoGeConfig) -> Tree:
+    """The sparse tree of LoRA factors of both halves."""
+    tree, lora = specs(config), config.lora
+    recon = lora_specs(
+        {k: tree[k] for k in ("encoder", "renderer")}, lora.recon_rank, lora.recon_match
+    )
+    return {**recon, "dit": lora_specs(tree["dit"], lora.dit_rank, lora.dit_match)}
+
+
+def split(params: Tree, pattern: str) -> tuple[Tree, Tree]:
+    """(leaves whose path matches `pattern`, the others): what trains and what is frozen."""
+    flat = flatten(params)
+    chosen = {path for path in flat if re.search(pattern, path)}
+    return (
+        unflatten({path: flat[path] for path in chosen}),
+        unflatten({path: leaf for path, leaf in flat.items() if path not in chosen}),
+    )
+
+
+# Reconstruction (Sec. 3.1).
+
+
+def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Array]:
+    """K of all views in pixels of the reconstruction images (a plain resize of the generation crop), and c2w."""
+    scale = jnp.asarray([config.recon_width / config.width, config.recon_height / config.height, 1.0])
+    return views["K"] * scale[None, :, None], views["c2w"]
+
+
+def resized(images: jax.Array, height: int, width: int) -> jax.Array:
+    if images.shape[1:3] == (height, width):
+        return images
+    return jax.image.resize(images, (images.shape[0], height, width, 3), "bilinear", antialias=True)
+
+
+def reconstruct(params: Tree, views: Views, *, config: RoGeConfig) -> jax.Array:
+    """The implicit scene: tokens Z [m, l, d] of the context photos."""
+    size = (config.recon_height, config.recon_width)
+    images = views.get("context_recon")
+    images = resized(views["context_rgb"], *size) if images is None else images
+    m = images.shape[0]
+    K, c2w = recon_cameras(views, config)
+    rays = plucker(K[:m], c2w[:m], *size)
+    return vggt.encode_scene(
+        params["encoder"], images, views["vectors"], rays, K[:m], c2w[:m], cfg=config.encoder
+    )
+
+
+def query_rays(params: Tree, scene_tokens: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
+    """Ray features Phi [v, gh, gw, d] of all views in `views` (contexts and targets)."""
+    cfg, size = config.renderer, (config.recon_height, config.recon_width)
+    K, c2w = recon_cameras(views, config)
+    rays: Relative | None = None
+    cameras: Relative | None = None
+    m = scene_tokens.shape[0]
+    if cfg.relative_cameras:
+        head_dim = cfg.width // cfg.heads
+        grid = (size[0] // cfg.patch, size[1] // cfg.patch)
+        rays = relative_cameras(
+            K, c2w, size, grid=grid, specials=cfg.registers, head_dim=head_dim
+        )
+        cameras = relative_cameras(
+            K[:m],
+            c2w[:m],
+            size,
+            grid=vggt.encoder_grid(config.encoder, *size),
+            specials=0,
+            head_dim=head_dim,
+        )
+    return ray_scene.query_rays(
+        params["renderer"],
+        scene_tokens,
+        plucker(K, c2w, *size),
+        cfg=cfg,
+        rays=rays,
+        cameras=cameras,
+        contexts=m,
+    )
+
+
+def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array:
+    """The reconstruction's own picture [v, recon_height, recon_width, 3] of ray features."""
+    return ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=config.renderer)
+
+
+# Generation (Sec. 3.2).
+
+
+def encode_contexts(params: Tree, context_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
+    """X^S [m, lh, lw, 16]: every photo encoded alone, as a video of one frame."""
+    return vae.encode_frames(params["vae"], 2.0 * context_rgb - 1.0, cfg=config.vae)
+
+
+def encode_targets(params: Tree, target_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
+    """X^T [1 + (n - 1) / 4, lh, lw, 16]: the target video through the causal VAE."""
+    return vae.encode(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
+
+
+def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax.Array:
+    """Target latents [t, lh, lw, 16] -> video [n, h, w, 3] in [0, 1]."""
+    return jnp.clip(0.5 + 0.5 * vae.decode(params["vae"], latents, cfg=config.vae), 0.0, 1.0)
+
+
+def condition(
+    params: Tree, context_latents: jax.Array, features: jax.Array, views: Views, *, config: RoGeConfig
+) -> Condition:
+    """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views."""
+    m = context_latents.shape[0]
+    rays = plucker(views["K"], views["c2w"], config.height, config.width)
+    return fusion.condition(params["fusion"], context_latents, rays, features, m)
+
+
+def velocity(
+    params: Tree,
+    x: jax.Array,
+    sigma: jax.Array,
+    cond: Condition,
+    *,
+    config: RoGeConfig,
+    contexts: int,
+    text: Tree | None = None,
+    remat: dit.Remat = "none",
+) -> jax.Array:
+    """V(x, sigma; C) [t, lh, lw, 16], noise - x0. `text` caches `text_cache` over sampling steps."""
+    cfg = config.dit
+    t, lh, lw, _ = x.shape
+    angles = dit.rope_angles(
+        fusion.time_index(contexts, t), lh // cfg.patch, lw // cfg.patch, cfg.width // cfg.heads
+    )
+    rows = None
+    if cfg.text_len and text is None:
+        rows = dit.context_rows(params["dit"], params["prompt"]["rows"], cfg=cfg)
+    return dit.dit(
+        params["dit"],
+        jnp.concatenate([x, cond.appearance], -1),
+        1000.0 * sigma,
+        jnp.asarray(angles),
+        cfg=cfg,
+        rows=rows,
+        kv=text,
+        extra_tokens=cond.tokens,
+        remat=remat,
+    )
+
+
+def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
+    """Cross-attention keys and values of the prompt, the same at every sampling step; None without text."""
+    if not config.dit.text_len:
+        return None
+    rows = dit.context_rows(params["dit"], params["prompt"]["rows"], cfg=config.dit)
+    return dit.precompute_context(params["dit"], rows, cfg=config.dit)
+
+
+# Training (Sec. 3.3).
+
+
+def photometric(params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
+    """Mean squared error of the RGB head over all M + N views."""
+    size = (config.recon_height, config.recon_width)
+    truth = [
+        resized(views[f"{kind}_rgb"], *size) if views.get(f"{kind}_recon") is None else views[f"{kind}_recon"]
+        for kind in ("context", "target")
+    ]
+    rgb = decode_rgb(params, features, config=config)
+    return jnp.square(rgb - jnp.concatenate(truth)).mean()
+
+
+def flow_matching(
+    params: Tree,
+    x0: jax.Array,
+    cond: Condition,
+    key: jax.Array,
+    *,
+    config: RoGeConfig,
+    contexts: int,
+    remat: dit.Remat = "full",
+) -> jax.Array:
+    """w(sigma) |M_t (V - (noise - x0))|^2, the mean over target latents, at one random noise level."""
+    key_sigma, key_noise = jax.random.split(key)
+    cfg = config.flow
+    sigma = flow.training_sigma(key_sigma, method=cfg.sigma_sampling, shift=cfg.shift)
+    noise = jax.random.normal(key_noise, x0.shape)
+    x = flow.x_sigma(x0, noise, sigma)
+    v = velocity(params, x, sigma, cond, config=config, contexts=contexts, remat=remat)
+    error = (v - flow.velocity_target(x0, noise))[contexts:]
+    return flow.loss_weight(sigma, weighting=cfg.weighting, shift=cfg.shift) * jnp.square(error).mean()
+
+
+def scene_loss(
+    params: Tree,
+    views: Views,
+    key: jax.Array,
+    *,
+    config: RoGeConfig,
+    draws: int = 1,
+    remat: dit.Remat = "full",
+) -> dict[str, jax.Array]:
+    """Both terms of the joint loss for one scene.
+
+    `draws` noise levels share one reconstruction and one encoding of the scene: the flow term is their mean.
+    """
+    m = views["context_rgb"].shape[0]
+    features = query_rays(params, reconstruct(params, views, config=config), views, config=config)
+    x0 = jnp.concatenate(
+        [
+            encode_contexts(params, views["context_rgb"], config=config),
+            encode_targets(params, views["target_rgb"], config=config),
+        ]
+    )
+    cond = condition(params, x0[:m], features, views, config=config)
+
+    def draw(key):
+        return flow_matching(params, x0, cond, key, config=config, contexts=m, remat=remat)
+
+    return {
+        "flow": jax.lax.map(draw, jax.random.split(key, draws)).mean(),
+        "photometric": photometric(params, features, views, config=config),
+    }
+
+
+def loss(
+    trainable: Tree,
+    frozen: Tree,
+    batch: Views,
+    key: jax.Array,
+    *,
+    config: RoGeConfig,
+    draws: int = 1,
+    remat: dit.Remat = "full",
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """L = L_FM + lambda L_photometric, the mean over a batch of scenes (leading axis of every array), and its terms.
+
+    `trainable` and `frozen` are sparse trees that together make the model; LoRA factors are leaves of `trainable`
+    beside the frozen kernels they adapt. What trains is therefore an argument.
+    """
+    params = attach(frozen, trainable)
+    keys = jax.random.split(key, batch["K"].shape[0])
+    terms = jax.vmap(
+        lambda views, key: scene_loss(params, views, key, config=config, draws=draws, remat=remat)
+    )(batch, keys)
+    terms = {name: value.mean() for name, value in terms.items()}
+    return terms["flow"] + config.flow.photometric * terms["photometric"], terms
+
+
+# Sampling.
+
+
+def context_projection(x0: jax.Array, noise: jax.Array, mode: ContextSlots) -> Callable | None:
+    """What happens to the context slots before the network looks: noised to sigma (as in training), clean, or free."""
+    m = x0.shape[0]
+    if mode == "free":
+        return None
+
+    def project(x, sigma):
+        known = flow.x_sigma(x0, noise[:m], sigma) if mode == "noised" else x0
+        return jnp.concatenate([known, x[m:]])
+
+    return project
