@@ -1,5 +1,7 @@
 """Path errors and TSED against closed forms, invariances and synthetic scenes."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -216,7 +218,7 @@ def test_partial_registration_is_reported_and_fails_below_ninety_percent():
     assert result["status"] == "ok" and result["coverage"] == 0.9 and np.isfinite(result["ape_t"])
     # the step from frame 3 to frame 6 is not a step of the path: it must not enter RPE
     kept = np.isfinite(estimate).all(axis=(1, 2))
-    shifts, angles = geo.relative_pose_errors(estimate[kept], truth[kept])
+    _, angles = geo.relative_pose_errors(estimate[kept], truth[kept])
     assert len(angles) == 17
     np.testing.assert_allclose(
         result["rpe_r"], np.sqrt(np.mean(np.delete(angles, 3) ** 2)), rtol=1e-9
@@ -261,7 +263,7 @@ def epipolar_scene(rng, n=5, k=40, step=0.2):
     c2w[:, :3, :3] = [axis_rotation([0, 1, 0.2], -3 * i) for i in range(n)]
     points = rng.uniform([-2, -2, 4], [2, 2, 8], (k, 3))
     pixels = [project(points, K[i], c2w[i]) for i in range(n)]
-    return K, c2w, points, list(zip(pixels[:-1], pixels[1:]))
+    return K, c2w, points, list(itertools.pairwise(pixels))
 
 
 def test_projections_of_true_points_have_no_epipolar_distance():
@@ -302,10 +304,10 @@ def test_the_thresholds_are_strict_in_pixels_and_inclusive_in_matches():
 
 def test_pairs_without_a_baseline_are_judged_by_rotation_or_dropped():
     rng = np.random.default_rng(2)
-    K, c2w, points, matches = epipolar_scene(rng, n=4)
+    K, c2w, points, _ = epipolar_scene(rng, n=4)
     c2w[2, :3, 3] = c2w[1, :3, 3] + 1e-9  # frames 1 and 2 share their centre
     pixels = [project(points, K[i], c2w[i]) for i in range(4)]
-    good = list(zip(pixels[:-1], pixels[1:]))
+    good = list(itertools.pairwise(pixels))
     result = epipolar.tsed_from_matches(good, K, c2w)
     assert result["tsed"] == 1.0 and result["zero_baseline"] == 1 and result["dropped"] == 0
     # a frozen frame where the cameras turn by 3 degrees (about 10 pixels) is not consistent

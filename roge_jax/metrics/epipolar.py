@@ -5,6 +5,7 @@ over thresholds and a rule for pairs without a baseline. Cameras: K [n, 3, 3] in
 at +0.5), c2w [n, 4, 4] OpenCV. float64 NumPy; OpenCV is imported only to find matches.
 """
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -186,7 +187,7 @@ def tsed(
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
     resized = [cv2.resize(np.float32(f), (new_w, new_h), interpolation=how) for f in frames]
     K = np.diag([new_w / w, new_h / h, 1.0]) @ K  # pixel edges stay at 0 and the new width
-    matches = [sift_matches(a, b) for a, b in zip(resized[:-1], resized[1:])]
+    matches = [sift_matches(a, b) for a, b in itertools.pairwise(resized)]
     result = tsed_from_matches(
         matches,
         K,
