@@ -1,0 +1,246 @@
+"""Speed of the diffusion transformer on one CPU core, against PyTorch, and of the choices inside it.
+
+    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about five minutes)
+
+One process, one thread each, float32, the same weights in both: our `dit` and diffusers' `WanTransformer3DModel`, both
+checked to give the same velocity first. Candidates take turns within a round, so drifts of a shared machine hit all of
+them; times are CPU time of the process (wall time on a busy core measures the neighbours). Reported are the median over
+rounds, the quartiles, and the median over rounds of the ratio within a round. The paper has no number for this.
+Writes experiments/results/dit_speed.json.
+"""
+
+import json
+import os
+import platform
+import subprocess
+import time
+from pathlib import Path
+
+THREADS = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+ROUNDS = 11
+RESULT = Path(__file__).parent / "results" / "dit_speed.json"
+
+
+def measure(candidates: dict, rounds: int) -> dict:
+    """CPU seconds per call of every candidate, taking turns. The first candidate is the reference of the ratios."""
+    import numpy as np
+
+    for call in candidates.values():
+        call()
+    seconds = {name: [] for name in candidates}
+    for i in range(rounds):
+        order = list(candidates) if i % 2 == 0 else list(candidates)[::-1]
+        for name in order:
+            start = time.process_time()
+            candidates[name]()
+            seconds[name].append(time.process_time() - start)
+    reference = np.array(seconds[next(iter(candidates))])
+    summary = {}
+    for name, values in seconds.items():
+        low, median, high = np.percentile(values, [25, 50, 75])
+        ratios = np.percentile(np.array(values) / reference, [25, 50, 75])
+        summary[name] = {
+            "seconds": round(float(median), 4),
+            "quartiles": [round(float(low), 4), round(float(high), 4)],
+            "ratio": round(float(ratios[1]), 3),
+            "ratio_quartiles": [round(float(ratios[0]), 3), round(float(ratios[2]), 3)],
+        }
+        print(f"  {name:28s} {median:8.4f} s   x{ratios[1]:.2f}", flush=True)
+    return summary
+
+
+def attention_variants():
+    """Three formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
+    import jax
+    import jax.numpy as jnp
+
+    from roge_jax.core.attention import attention
+
+    def naive(q, k, v):
+        s = jnp.einsum("qhe,she->hqs", q, k) * q.shape[-1] ** -0.5
+        return jnp.einsum("hqs,she->qhe", jax.nn.softmax(s, -1), v)
+
+    def library(q, k, v):
+        return jax.nn.dot_product_attention(q[None], k[None], v[None])[0]
+
+    return {"late normalised (ours)": attention, "dot_product_attention": library, "naive": naive}
+
+
+def attention_speed(tokens: int, heads: int, head_dim: int) -> dict:
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    q, k, v = (
+        jnp.asarray(rng.standard_normal((tokens, heads, head_dim), np.float32)) for _ in "qkv"
+    )
+    forward, backward = {}, {}
+    for name, f in attention_variants().items():
+        run = jax.jit(f)
+        grad = jax.jit(jax.grad(lambda q, k, v, f=f: jnp.sum(jnp.sin(f(q, k, v))), (0, 1, 2)))
+        forward[name] = lambda run=run: jax.block_until_ready(run(q, k, v))
+        backward[name] = lambda grad=grad: jax.block_until_ready(grad(q, k, v))
+    print(f"attention, {tokens} tokens, {heads} heads of {head_dim}: forward")
+    result = {"forward": measure(forward, ROUNDS)}
+    print("attention: forward and backward")
+    return result | {"forward_backward": measure(backward, ROUNDS)}
+
+
+def torch_twin(cfg, params):
+    """diffusers' transformer holding our parameters, ready for gradients of all of them."""
+    import torch
+    from diffusers import WanTransformer3DModel
+
+    from roge_jax.weights.mapping import to_theirs
+    from roge_jax.weights.wan_dit import dit_entries
+
+    model = WanTransformer3DModel(
+        num_attention_heads=cfg.heads,
+        attention_head_dim=cfg.width // cfg.heads,
+        in_channels=cfg.in_channels,
+        out_channels=cfg.out_channels,
+        text_dim=cfg.text_dim,
+        freq_dim=cfg.freq_dim,
+        ffn_dim=cfg.ffn,
+        num_layers=cfg.depth,
+    )
+    tensors = to_theirs(dit_entries(cfg, names="diffusers"), params)
+    model.load_state_dict({key: torch.from_numpy(value.copy()) for key, value in tensors.items()})
+    return model
+
+
+def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
+    """Whole forward passes, and gradients of all parameters, of one video."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    import torch
+
+    from roge_jax.core import params as trees
+    from roge_jax.video import dit as net
+
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    params = {
+        path: leaf + 0.02 * rng.standard_normal(leaf.shape, np.float32)
+        for path, leaf in trees.flatten(trees.init(jax.random.key(0), net.dit_specs(cfg))).items()
+    }
+    params = trees.unflatten(params)
+    x = rng.standard_normal((slots, 2 * rows, 2 * columns, cfg.in_channels), np.float32)
+    text = rng.standard_normal((cfg.text_len, cfg.text_dim), np.float32)
+    angles = net.rope_angles(range(slots), rows, columns, cfg.width // cfg.heads)
+    timestep = 500.0
+
+    def velocity(params, **options):
+        rows = net.context_rows(params, text, cfg=cfg)
+        return net.dit(
+            params, x, timestep, angles, cfg=cfg, rows=rows, split="text_last", **options
+        )
+
+    def ours(**options):
+        compiled = jax.jit(lambda p: velocity(p, **options)).lower(params).compile()
+        return lambda: jax.block_until_ready(compiled(params))
+
+    def our_gradient(**options):
+        start = time.process_time()
+        grad = jax.grad(lambda p: jnp.sum(jnp.sin(velocity(p, **options))))
+        compiled = jax.jit(grad).lower(params).compile()
+        compile_seconds[str(options or "scan")] = round(time.process_time() - start, 2)
+        return lambda: jax.block_until_ready(compiled(params))
+
+    model = torch_twin(cfg, params)
+    latents = torch.from_numpy(np.moveaxis(x, -1, 0).copy())[None]
+    context, steps = torch.from_numpy(text)[None], torch.tensor([timestep])
+
+    def theirs():
+        with torch.no_grad():
+            return model(latents, steps, context, return_dict=False)[0]
+
+    def their_gradient():
+        model.zero_grad(set_to_none=True)
+        model(latents, steps, context, return_dict=False)[0].sin().sum().backward()
+
+    reference = np.moveaxis(theirs()[0].numpy(), 0, -1)
+    forward = ours()
+    error = float(np.linalg.norm(forward() - reference) / np.linalg.norm(reference))
+    assert error < 1e-5, f"the two networks differ by {error:.1e}"
+    compile_seconds: dict[str, float] = {}
+    print(f"transformer, {angles.shape[0]} tokens, {cfg}: forward")
+    result = {
+        "relative_l2_between_frameworks": error,
+        "forward": measure(
+            {"torch": theirs, "scan": forward, "unrolled": ours(unroll=cfg.depth)}, ROUNDS
+        ),
+    }
+    print("transformer: forward and backward, all parameters")
+    gradients = {
+        "torch": their_gradient,
+        "scan": our_gradient(),
+        "unrolled": our_gradient(unroll=cfg.depth),
+        "scan, recompute all": our_gradient(remat="full"),
+        "scan, keep dots": our_gradient(remat="dots"),
+    }
+    result["forward_backward"] = measure(gradients, ROUNDS)
+    return result | {"compile_seconds_forward_backward": compile_seconds}
+
+
+def main() -> None:
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {THREADS}".strip()
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ[name] = "1"
+    import dataclasses
+
+    import diffusers
+    import jax
+    import torch
+
+    from roge_jax.config import DiTConfig
+
+    # Six heads of 64 and four blocks; 1008 tokens are 8 latent slots of 144 x 224 pixels or so.
+    cfg = DiTConfig(
+        width=384, heads=6, depth=4, ffn=1536, in_channels=16, text_dim=64, text_len=512, clip_dim=0
+    )
+    grid = {"slots": 8, "rows": 9, "columns": 14}
+    result = {
+        "settings": {
+            "transformer": dataclasses.asdict(cfg),
+            "grid": grid,
+            "rounds": ROUNDS,
+            "threads": 1,
+            "clock": "CPU time of the process",
+            "dtype": "float32",
+        },
+        "versions": {
+            "jax": jax.__version__,
+            "torch": torch.__version__,
+            "diffusers": diffusers.__version__,
+            "python": platform.python_version(),
+        },
+        "device": cpu_name(),
+        "commit": commit(),
+        "transformer": transformer_speed(cfg, **grid),
+        "attention": attention_speed(1008, cfg.heads, cfg.width // cfg.heads),
+    }
+    RESULT.parent.mkdir(exist_ok=True)
+    RESULT.write_text(json.dumps(result, indent=1) + "\n")
+    print(f"wrote {RESULT}")
+
+
+def cpu_name() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def commit() -> str:
+    folder = Path(__file__).parent
+    out = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=folder, capture_output=True, text=True
+    )
+    return out.stdout.strip() or "unknown"
+
+
+if __name__ == "__main__":
+    main()
