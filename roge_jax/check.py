@@ -78,9 +78,10 @@ def check(config: Config) -> Report:
         scene = open_scene(
             config.scene,
             convention=config.convention,
-            frames=16,
+            frames=8,
             height=config.height,
             width=config.width,
+            supersample=1,
         )
     except UserError as error:
         finding = Finding("error", "scene", str(error).rstrip("."), "nothing else was looked at")
@@ -231,7 +232,7 @@ def render(report: Report) -> str:
     if "divisor" in n:
         (v0, v1), (h0, h1) = n["vertical_fov_degrees"], n["horizontal_fov_degrees"]
         lines += [
-            f"view      {_span(h0, h1)} x {_span(v0, v1)} degrees; a crop keeps {n['crop_keeps']:.0%}",
+            f"view      {_span(h0, h1)} x {_span(v0, v1)} degrees; crops keep {n['crop_keeps']:.0%}",
             f"baseline  {n['baseline_max']:.4g} at most, {n['baseline_neighbours']:.4g} between "
             f"neighbours; the scene is about {n['focus_distance']:.4g} away",
             f"scale     divisor {n['divisor']:.6g} ({n['status']}); straightness "

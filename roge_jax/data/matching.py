@@ -1,4 +1,4 @@
-"""Do the photos agree with their poses? Epipolar distances of matched features, by OpenCV's SIFT."""
+"""Do the photos agree with their poses? Epipolar distances of features matched by OpenCV's SIFT."""
 
 from collections.abc import Sequence
 
