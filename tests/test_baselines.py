@@ -143,9 +143,7 @@ def test_shrinking_is_antialiased():
     assert np.abs(inner - 0.5).max() < 0.2  # three samples per axis: 1/6 is the worst phase
     plain = bl.bilinear(
         stripes,
-        bl._project(bl._grid(60, 60), np.full((60, 60), 3.0), k, pose(), k, pose((0, 0, -2.0)))[
-            0
-        ],
+        bl._project(bl._grid(60, 60), np.full((60, 60), 3.0), k, pose(), k, pose((0, 0, -2.0)))[0],
     )
     assert np.abs(plain[25:35, 25:35] - 0.5).max() > 0.3
 

@@ -1,0 +1,214 @@
+"""LPIPS: parity with a plain PyTorch twin on random weights, and every way a file can be wrong."""
+
+import hashlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from roge_jax.errors import UserError
+from roge_jax.metrics import learned
+
+
+def random_tensors(trunk, seed=0):
+    """Official names and shapes; He-scaled, so that no layer dies; heads not negative."""
+    rng = np.random.default_rng(seed)
+    out = {}
+    for name, shape in learned.lpips_specs(trunk).items():
+        if name.startswith("lin"):
+            out[name] = rng.random(shape, np.float32)
+        elif name.endswith("bias"):
+            out[name] = 0.1 * rng.standard_normal(shape, np.float32)
+        else:
+            out[name] = rng.standard_normal(shape, np.float32) * np.float32(
+                np.sqrt(2 / np.prod(shape[1:]))
+            )
+    return out
+
+
+@pytest.fixture(scope="module")
+def alex():
+    return random_tensors("alex")
+
+
+def images(n=2, h=45, w=53, seed=1):
+    rng = np.random.default_rng(seed)
+    return rng.random((n, h, w, 3), np.float32), rng.random((n, h, w, 3), np.float32)
+
+
+def torch_lpips(trunk, tensors, a, b):
+    """Straight from the papers' layer lists, float64; [n, h, w, 3] in [0, 1]."""
+    torch = pytest.importorskip("torch")
+    F = torch.nn.functional
+    t = {name: torch.from_numpy(x).double() for name, x in tensors.items()}
+    vgg = [64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512]
+
+    def features(x):
+        x = torch.from_numpy(x).double().permute(0, 3, 1, 2) * 2 - 1
+        shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+        x = (x - shift.double().view(1, 3, 1, 1)) / scale.double().view(1, 3, 1, 1)
+        taps, index = [], 0
+        if trunk == "vgg":
+            for layer in vgg:
+                if layer == "M":
+                    taps.append(x)
+                    x, index = F.max_pool2d(x, 2, 2), index + 1
+                else:
+                    w, bias = t[f"features.{index}.weight"], t[f"features.{index}.bias"]
+                    assert w.shape[0] == layer
+                    x, index = F.relu(F.conv2d(x, w, bias, padding=1)), index + 2
+            return [*taps, x]
+        for index, stride, padding in ((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)):
+            if index in (3, 6):
+                x = F.max_pool2d(x, 3, 2)
+            w, bias = t[f"features.{index}.weight"], t[f"features.{index}.bias"]
+            x = F.relu(F.conv2d(x, w, bias, stride=stride, padding=padding))
+            taps.append(x)
+        return taps
+
+    total = 0
+    for k, (f, g) in enumerate(zip(features(a), features(b))):
+        f, g = (y / (y.norm(dim=1, keepdim=True) + 1e-10) for y in (f, g))
+        total = total + F.conv2d((f - g) ** 2, t[f"lin{k}.model.1.weight"]).mean(dim=(1, 2, 3))
+    return total.numpy()
+
+
+@pytest.mark.parametrize("trunk", ["alex", "vgg"])
+def test_parity_with_pytorch_on_random_weights(trunk):
+    tensors = random_tensors(trunk)
+    a, b = images() if trunk == "alex" else images(1, 21, 34)
+    params = learned.from_official(trunk, tensors)
+    found = learned.lpips(params, a, b, trunk=trunk)
+    assert found.shape == (len(a),) and found.dtype == jnp.float32
+    # float32 against float64 through at most 13 convolutions
+    np.testing.assert_allclose(found, torch_lpips(trunk, tensors, a, b), rtol=1e-5)
+
+
+def test_layers_are_the_official_ones():
+    vgg = [c.key for c in learned.TRUNKS["vgg"].convs]
+    assert vgg == [f"features.{i}" for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)]
+    taps = [c.key for c in learned.TRUNKS["vgg"].convs if c.tap]
+    assert taps == [f"features.{i}" for i in (2, 7, 14, 21, 28)]
+    count = {
+        name: sum(np.prod(s) for s in learned.lpips_specs(name).values()) for name in learned.TRUNKS
+    }
+    # the published sizes of both convolution stacks, plus the heads
+    assert count["vgg"] == 14_714_688 + 64 + 128 + 256 + 512 + 512
+    assert count["alex"] == 2_469_696 + 64 + 192 + 384 + 256 + 256
+
+
+def test_distance_properties_and_jit(alex):
+    params = learned.from_official("alex", alex)
+    a, b = images()
+    d = learned.lpips(params, a, b, trunk="alex")
+    np.testing.assert_allclose(learned.lpips(params, b, a, trunk="alex"), d, rtol=1e-6)
+    np.testing.assert_allclose(learned.lpips(params, a, a, trunk="alex"), 0.0, atol=1e-12)
+    inside = jax.jit(lambda p, x, y: learned.lpips(p, x, y, trunk="alex"))(params, a[0], b[0])
+    assert inside.shape == ()
+    np.testing.assert_allclose(inside, d[0], rtol=1e-6)
+
+
+def test_inputs_are_checked(alex):
+    params = learned.from_official("alex", alex)
+    a, b = images(1)
+    with pytest.raises(UserError, match=r"the image spans \[-1, 1\]"):
+        learned.lpips(params, np.clip(4 * a - 2, -1, 1), b, trunk="alex")
+    with pytest.raises(UserError, match="reference spans"):
+        learned.lpips(params, a, 255 * b, trunk="alex")
+    with pytest.raises(UserError, match=r"spans \[nan"):
+        learned.lpips(params, np.full_like(a, np.nan), b, trunk="alex")
+    with pytest.raises(UserError, match="the image is uint8"):
+        learned.lpips(params, (255 * a).astype(np.uint8), b, trunk="alex")
+    with pytest.raises(UserError, match="one shape"):
+        learned.lpips(params, a, b[:, 1:], trunk="alex")
+    with pytest.raises(UserError, match="at least 32 x 32"):
+        learned.lpips(params, a[:, :31], b[:, :31], trunk="alex")
+    learned.lpips(params, a * 1.002 - 0.0009, b, trunk="alex")
+
+
+def test_shape_table_names_every_wrong_tensor(alex):
+    bad = dict(alex)
+    bad["features.3.bias"] = bad["features.3.bias"][:-1]
+    bad["surplus"] = bad.pop("features.8.weight")
+    bad["lin2.model.1.weight"] = -bad["lin2.model.1.weight"]
+    bad["features.0.bias"] = np.full_like(bad["features.0.bias"], np.nan)
+    with pytest.raises(UserError) as caught:
+        learned.from_official("alex", bad)
+    text = str(caught.value)
+    for part in (
+        "features.8.weight is missing",
+        "surplus is unknown",
+        "features.3.bias has shape (191,), not (192,)",
+        "lin2.model.1.weight has negative weights",
+        "features.0.bias holds NaN",
+    ):
+        assert part in text
+    learned.from_official(
+        "alex", alex | {"classifier.1.weight": np.zeros((4096, 9216), np.float32)}
+    )
+
+
+def test_missing_file_says_which_whence_how_large_and_how_to_skip(tmp_path, monkeypatch):
+    monkeypatch.delenv("ROGE_WEIGHTS", raising=False)
+    with pytest.raises(UserError) as caught:
+        learned.load_lpips("vgg", tmp_path)
+    assert str(caught.value) == (
+        "LPIPS(vgg) needs vgg16-397923af.pth (528 MB, https://download.pytorch.org/models/vgg16-397923af.pth). "
+        f"Not found in {tmp_path}. Put it there or set ROGE_WEIGHTS; use --skip lpips to go on without it."
+    )
+    with pytest.raises(UserError, match="no folder given"):
+        learned.load_lpips("alex")
+    with pytest.raises(UserError, match="did you mean 'vgg'"):
+        learned.load_lpips("vgg16", tmp_path)
+
+
+def test_loads_the_users_files(tmp_path, monkeypatch, alex):
+    from safetensors.numpy import save_file
+
+    heads = {k: v for k, v in alex.items() if k.startswith("lin")}
+    trunk = {k: v for k, v in alex.items() if not k.startswith("lin")}
+    save_file(trunk, tmp_path / "alexnet-owt-7be5be79.safetensors")
+    monkeypatch.setattr(learned, "_wheel_heads", lambda trunk: None)
+    with pytest.raises(UserError, match=r"needs lpips_alex\.pth \(10 kB"):
+        learned.load_lpips("alex", tmp_path)
+    save_file(heads, tmp_path / "lpips_alex.safetensors")
+    monkeypatch.setenv("ROGE_WEIGHTS", str(tmp_path))
+    params = learned.load_lpips("alex")
+    expected = learned.from_official("alex", alex)
+    assert jax.tree.structure(params) == jax.tree.structure(expected)
+    jax.tree.map(np.testing.assert_array_equal, params, expected)
+
+
+def test_pytorch_files_are_read_and_their_hash_is_checked(tmp_path, monkeypatch, alex):
+    torch = pytest.importorskip("torch")
+    path = tmp_path / "alexnet-owt-7be5be79.pth"
+    torch.save({k: torch.from_numpy(v) for k, v in alex.items() if k[0] == "f"}, path)
+    torch.save(
+        {k: torch.from_numpy(v) for k, v in alex.items() if k[0] == "l"},
+        tmp_path / "lpips_alex.pth",
+    )
+    with pytest.raises(UserError, match="not the official file: its SHA-256 begins with"):
+        learned.load_lpips("alex", tmp_path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+    renamed = path.rename(tmp_path / f"alexnet-{digest}.pth")
+    monkeypatch.setitem(learned.TRUNKS, "alex", learned.TRUNKS["alex"]._replace(file=renamed.name))
+    params = learned.load_lpips("alex", tmp_path)
+    np.testing.assert_array_equal(
+        params["features.0"]["kernel"], alex["features.0.weight"].transpose(2, 3, 1, 0)
+    )
+
+
+def test_truncated_files_are_named(tmp_path, alex):
+    from safetensors.numpy import save_file
+
+    path = tmp_path / "x.safetensors"
+    save_file(alex, path)
+    path.write_bytes(path.read_bytes()[:5000])
+    with pytest.raises(UserError, match=r"x\.safetensors is not a complete safetensors file"):
+        learned.read_tensors(path)
+    pytest.importorskip("torch")
+    broken = tmp_path / "x.pth"
+    broken.write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(UserError, match=r"x\.pth cannot be read as a PyTorch file"):
+        learned.read_tensors(broken)
