@@ -42,6 +42,7 @@ def measure(candidates: dict, rounds: int) -> dict:
         summary[name] = {
             "seconds": round(float(median), 4),
             "quartiles": [round(float(low), 4), round(float(high), 4)],
+            "minimum": round(min(values), 4),
             "ratio": round(float(ratios[1]), 3),
             "ratio_quartiles": [round(float(ratios[0]), 3), round(float(ratios[2]), 3)],
         }
@@ -70,6 +71,8 @@ def attention_speed(tokens: int, heads: int, head_dim: int) -> dict:
     import jax
     import jax.numpy as jnp
     import numpy as np
+    import torch
+    from torch.nn.functional import scaled_dot_product_attention as sdpa
 
     rng = np.random.default_rng(0)
     q, k, v = (
@@ -81,6 +84,15 @@ def attention_speed(tokens: int, heads: int, head_dim: int) -> dict:
         grad = jax.jit(jax.grad(lambda q, k, v, f=f: jnp.sum(jnp.sin(f(q, k, v))), (0, 1, 2)))
         forward[name] = lambda run=run: jax.block_until_ready(run(q, k, v))
         backward[name] = lambda grad=grad: jax.block_until_ready(grad(q, k, v))
+    twins = [torch.from_numpy(np.asarray(a).swapaxes(0, 1)[None].copy()) for a in (q, k, v)]
+    leaves = [a.clone().requires_grad_() for a in twins]
+
+    def their_gradient():
+        for leaf in leaves:
+            leaf.grad = None
+        sdpa(*leaves).sin().sum().backward()
+
+    forward["torch"], backward["torch"] = lambda: sdpa(*twins), their_gradient
     print(f"attention, {tokens} tokens, {heads} heads of {head_dim}: forward")
     result = {"forward": measure(forward, ROUNDS)}
     print("attention: forward and backward")

@@ -263,6 +263,7 @@ def dit_blocks(
     unroll: int = 1,
 ) -> jax.Array:
     """All blocks on tokens x [l, d]. Cross-attention reads `kv` (precomputed) or computes it from `rows` in each block."""
+    assert angles.shape == (x.shape[0], cfg.width // cfg.heads // 2), (angles.shape, x.shape)
     assert (rows is None) or (kv is None), "context rows or their keys and values, not both"
     assert bool(cfg.text_len) == (rows is not None or kv is not None), "context iff text_len > 0"
 
