@@ -67,7 +67,7 @@ def test_rays_invert_to_pixels(seed):
 @given(seeds)
 def test_K_maps_rays_to_pixels(seed):
     """K R^T d is proportional to (x + 0.5, y + 0.5, 1), with skew and any principal point."""
-    cameras, rays = cast(seed)
+    cameras, _ = cast(seed)
     ours = np.asarray(plucker(cameras.K, cameras.c2w, HEIGHT, WIDTH), np.float64)
     local = np.einsum("vji,vhwj->vhwi", cameras.c2w[:, :3, :3], ours[..., :3])
     pixels = np.einsum("vij,vhwj->vhwi", cameras.K, local)

@@ -68,7 +68,7 @@ def read_header(file: Path) -> Header:
         )
     try:
         with Image.open(file) as picture:
-            orientation = int(picture.getexif().get(EXIF_ORIENTATION, 1))
+            orientation = _orientation_tag(picture)
             bands = picture.getbands()
             alpha = "A" in bands or "a" in bands or "transparency" in picture.info
             mode = picture.mode
@@ -89,27 +89,36 @@ def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.
       exif: turn the picture as its EXIF orientation says; False keeps the stored grid.
     Raises: UserError for missing, damaged, HDR, floating point or profile-less CMYK files.
     """
-    from PIL import Image, ImageOps
+    from PIL import Image
 
     header = read_header(file)
     try:
         if _is_deep(file):
             pixels = _read_deep(file)
-            pixels = _upright(pixels, header.orientation) if exif else pixels
         else:
             with Image.open(file) as picture:
                 picture.load()
-                shown = ImageOps.exif_transpose(picture) if exif else picture
-                shown.info = picture.info
-                pixels = np.asarray(_to_rgb(shown, file), np.float32) / np.float32(255)
+                pixels = np.asarray(_to_rgb(picture, file), np.float32) / np.float32(255)
     except UserError:
         raise
     except Exception as error:
         raise UserError(f"{file}: damaged or truncated picture ({error}).") from None
+    pixels = _upright(pixels, header.orientation) if exif else pixels
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:]
         pixels = pixels[..., :3] * alpha + np.float32(background) * (1 - alpha)
     return np.ascontiguousarray(pixels, np.float32)
+
+
+def _orientation_tag(picture: Any) -> int:
+    """The EXIF orientation from the header. Pillow would decode a whole PNG to look behind it."""
+    from PIL import Image
+
+    if picture.format != "PNG":
+        return int(picture.getexif().get(EXIF_ORIENTATION, 1))
+    exif = Image.Exif()
+    exif.load(picture.info.get("exif", b""))
+    return int(exif.get(EXIF_ORIENTATION, 1))
 
 
 def _is_deep(file: Path) -> bool:
@@ -153,6 +162,8 @@ def _to_rgb(picture: Any, file: Path) -> Any:
     if profile and picture.mode in ("RGB", "CMYK"):
         try:
             source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+            if "srgb" in ImageCms.getProfileDescription(source).lower():
+                return picture.convert("RGB")  # the conversion would only add rounding
             return ImageCms.profileToProfile(
                 picture, source, ImageCms.createProfile("sRGB"), outputMode="RGB"
             )
@@ -166,7 +177,7 @@ def _to_rgb(picture: Any, file: Path) -> Any:
 
 def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     """Stored [h, w, c] to displayed, for the EXIF orientations 1..8."""
-    mirrored = {2: (0, True), 4: (2, True), 5: (3, True), 7: (1, True)}
+    mirrored = {2: (0, True), 4: (2, True), 5: (1, True), 7: (3, True)}
     turns, flip = mirrored.get(orientation, (QUARTER_TURNS.get(orientation, 0), False))
     return np.rot90(pixels[:, ::-1] if flip else pixels, turns)
 

@@ -1,0 +1,637 @@
+"""One test for every way in which cameras and photos can be odd: what is found, what happens."""
+
+import io
+import json
+import struct
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scene_files as files
+from camera_cases import (
+    assert_same_inputs,
+    looking_at_origin,
+    moved,
+    network_inputs,
+    random_cameras,
+    random_K,
+    random_rigid,
+    random_rotation,
+    seeds,
+)
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scene_files import HEIGHT, WIDTH, picture
+
+from roge_jax.data.images import _upright, read_image
+from roge_jax.data.scene import Scene, load_scene, prepare
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import (
+    Cameras,
+    CameraWarning,
+    inspect,
+    normalise,
+    opencv_to_opengl,
+    straightness,
+    to_opencv,
+    validate,
+)
+from roge_jax.geometry.crops import crop_resize, crop_resize_K, resize, scale_K, turn
+from roge_jax.geometry.packing import pack_views
+from roge_jax.geometry.rays import plucker, plucker_float64, project, ray_distance, triangulate
+from roge_jax.geometry.validation import nearest_rotation
+
+few = settings(max_examples=25, deadline=None)
+
+
+def some(views: int = 4, seed: int = 0) -> Cameras:
+    return random_cameras(np.random.default_rng(seed), views, HEIGHT, WIDTH)
+
+
+def check_cameras(cameras: Cameras):
+    return validate(cameras, HEIGHT, WIDTH, [f"v{i}.png" for i in range(len(cameras))])
+
+
+# Scale and counts
+
+
+@pytest.mark.parametrize("baseline", [0.0, 1e-7])
+def test_coincident_centres(baseline):
+    """No division by a distance that is zero or only hand-shake: the targets give the scale."""
+    every = some(5)
+    every.c2w[:3, :3, 3] = [1.0, 2.0, 3.0]
+    every.c2w[1, 0, 3] += baseline
+    context, target, info = normalise(every[:3], every[3:])
+    assert info.status == "coincident_centres" and "fix no scale" in info.notes[0]
+    assert (info.camera_scale, info.points_flag) == (0.0, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(target.centres, axis=-1).max(), 1 / 1.35)
+    assert np.isfinite(context.c2w).all() and np.abs(context.centres).max() < 1e-6
+
+
+def test_single_context():
+    """The scale comes from the targets, or stays as it is where LagerNVS's rule is asked for."""
+    every = some(3)
+    _, target, info = normalise(every[:1], every[1:])
+    assert (info.status, info.camera_scale, info.points_flag) == ("single_view", 0.0, 1.0)
+    np.testing.assert_allclose(np.linalg.norm(target.centres, axis=-1).max(), 1 / 1.35)
+    _, _, lager = normalise(every[:1], every[1:], degenerate="one")
+    assert (lager.divisor, lager.camera_scale, lager.points_flag) == (1.0, 0.0, 1.0)
+
+
+def test_no_views():
+    every = some(2)
+    with pytest.raises(UserError, match="no context views"):
+        normalise(every[:0], every)
+    with pytest.raises(UserError, match="no target views"):
+        normalise(every, every[:0])
+
+
+def test_duplicate_views():
+    """A photo given twice counts once; the same pose with another picture is kept."""
+    images = [picture(v).astype(np.float32) / 255 for v in (0, 1, 0, 3)]
+    cameras = some(4)
+    cameras.c2w[2:], cameras.K[2:] = cameras.c2w[[0, 0]], cameras.K[[0, 0]]
+    scene = Scene(images, cameras, ("a", "b", "c", "d"), "test")
+    with pytest.warns(CameraWarning, match="same pose and picture as another view: c"):
+        pictures, kept = prepare(scene, [0, 1, 2, 3], 16, 16)
+    expected, single = prepare(scene, [0, 1, 3], 16, 16)
+    np.testing.assert_array_equal(pictures, expected)
+    np.testing.assert_array_equal(kept.c2w, single.c2w)
+    assert prepare(scene, [0, 1, 2], 16, 16, drop_duplicates=False)[0].shape[0] == 3
+
+
+def test_collinear_centres():
+    """Fine for rays; the number that flags it is small."""
+    line = random_cameras(np.random.default_rng(0), 6, straight=True)
+    assert straightness(line) < 1e-2 < straightness(some(6))
+    _, rays, status = network_inputs(line[:3], line[3:])
+    assert np.isfinite(rays).all() and status == "ok"
+
+
+def test_pure_rotation():
+    """A tripod scene: the rays are those of the rotations alone."""
+    every = some(4)
+    every.c2w[:, :3, 3] = 5.0
+    still = Cameras(every.K, every.c2w.copy())
+    still.c2w[:, :3, 3] = 0.0
+    _, rays, status = network_inputs(every[:2], every[2:])
+    _, expected, _ = network_inputs(still[:2], still[2:])
+    assert status == "coincident_centres"
+    np.testing.assert_allclose(rays, expected, atol=1e-6)
+    np.testing.assert_allclose(rays[..., 3:], 0.0, atol=1e-6)
+
+
+# Poses
+
+
+@few
+@given(seeds, st.integers(0, 2))
+def test_mirrored_axes(seed, column):
+    """Flipping any one axis turns a rotation into a mirror: refused, with a hint."""
+    cameras = some(3, seed)
+    cameras.c2w[1, :3, column] *= -1
+    with pytest.raises(UserError, match=r"view 1 \(v1.png\), c2w: mirrored.*left-handed"):
+        check_cameras(cameras)
+
+
+def test_opengl_read_as_opencv():
+    """Inward cameras whose axes are reversed meet behind themselves: a warning names the cure."""
+    good = looking_at_origin(5)
+    assert not inspect(good, HEIGHT, WIDTH)[1]
+    wrong = Cameras(good.K, opencv_to_opengl(good.c2w))
+    with pytest.warns(CameraWarning, match="convention='opengl'"):
+        check_cameras(wrong)
+    np.testing.assert_allclose(to_opencv(wrong.c2w, "opengl"), good.c2w)
+
+
+@pytest.mark.parametrize("size", [1e-7, 1e-6, 1e-4, 1e-3, 0.03, 0.3])
+def test_rotations_that_are_none(size):
+    """Three bands of |R^T R - I|: as it is, nearest rotation with a warning, refused."""
+    cameras = some(3)
+    R = cameras.c2w[1, :3, :3].copy()
+    shear = np.eye(3)
+    shear[0, 1] = size / np.sqrt(2)  # |R^T R - I| = size to first order
+    cameras.c2w[1, :3, :3] = R @ shear
+    if size < 1e-5:
+        np.testing.assert_array_equal(check_cameras(cameras).c2w, cameras.c2w)
+    elif size < 1e-2:
+        with pytest.warns(CameraWarning, match=r"not orthonormal.*degrees"):
+            mended = check_cameras(cameras).c2w[1, :3, :3]
+        np.testing.assert_allclose(mended.T @ mended, np.eye(3), atol=1e-12)
+        assert np.linalg.norm(mended - R) < size
+    else:
+        with pytest.raises(UserError, match="R is no rotation"):
+            check_cameras(cameras)
+
+
+def test_scaled_rotations():
+    """A similarity instead of a rigid pose: refused, and the factor is told."""
+    cameras = some(3)
+    cameras.c2w[2, :3, :3] *= 2.5
+    with pytest.raises(UserError, match=r"view 2 .* scale of 2\.5; divide"):
+        check_cameras(cameras)
+
+
+@few
+@given(seeds)
+def test_nearest_rotation_is_nearest(seed):
+    rng = np.random.default_rng(seed)
+    R = random_rotation(rng)
+    noisy = R + 1e-3 * rng.normal(size=(3, 3))
+    best = nearest_rotation(noisy)
+    gap = np.linalg.norm(best - noisy)
+    for _ in range(5):
+        turn_by = random_rigid(rng)[:3, :3] if rng.random() < 0.2 else np.eye(3)
+        small = nearest_rotation(np.eye(3) + 1e-3 * rng.normal(size=(3, 3)))
+        assert np.linalg.norm(best @ small @ turn_by - noisy) >= gap - 1e-12
+
+
+def test_last_row():
+    """3x4 is completed; any other last row is refused, a transposed matrix recognised."""
+    cameras = some(2)
+    short = Cameras(cameras.K, cameras.c2w[:, :3])
+    np.testing.assert_array_equal(check_cameras(short).c2w, cameras.c2w)
+    wrong = Cameras(cameras.K, cameras.c2w.copy())
+    wrong.c2w[1, 3] = [0, 0, 0, 2]
+    with pytest.raises(UserError, match=r"view 1 .*last row"):
+        check_cameras(wrong)
+    wrong.c2w[1] = cameras.c2w[1].T
+    with pytest.raises(UserError, match="looks transposed"):
+        check_cameras(wrong)
+    with pytest.raises(UserError, match="4x4 or 3x4"):
+        check_cameras(Cameras(cameras.K, cameras.c2w[:, :2]))
+
+
+@few
+@given(st.integers(0, 2), st.integers(0, 24), st.sampled_from([np.nan, np.inf, -np.inf]))
+def test_numbers_that_are_none(view, entry, value):
+    """NaN or infinity anywhere: refused, naming the view and the field; also by `normalise`."""
+    cameras = some(3)
+    K, c2w = cameras.K.copy(), cameras.c2w.copy()
+    if entry < 16:
+        c2w[view].flat[entry] = value
+    else:
+        K[view].flat[entry - 16] = value
+    field = "c2w" if entry < 16 else "K"
+    with pytest.raises(UserError, match=rf"view {view} \(v{view}.png\), {field}: entry \["):
+        check_cameras(Cameras(K, c2w))
+    with pytest.raises(UserError, match=f"context view {view} has NaN"):
+        normalise(Cameras(K, c2w), cameras)
+
+
+# Intrinsics
+
+
+def with_K(**entries: float) -> Cameras:
+    cameras = looking_at_origin(2)
+    places = {"fx": (0, 0), "skew": (0, 1), "cx": (0, 2), "fy": (1, 1), "cy": (1, 2)}
+    K = cameras.K.copy()
+    for name, value in entries.items():
+        K[1][places[name]] = value
+    return Cameras(K, cameras.c2w)
+
+
+@pytest.mark.parametrize(
+    ("entries", "severity", "words"),
+    [
+        ({"fx": 0.0}, "error", "focal length fx = 0"),
+        ({"fy": -40.0}, "error", "must be positive"),
+        ({"fx": 1.5, "fy": 41.0}, "error", "give it in pixels"),
+        ({"fx": 1.9, "fy": 1.9, "cx": 20.0}, "error", "give it in pixels"),
+        ({"fx": 41.0 * 60, "fy": 41.0 * 60}, "warning", "times the width"),
+        ({"fx": 40.0, "fy": 15.0}, "warning", "far from square"),
+    ],
+)
+def test_focal_lengths(entries, severity, words):
+    _, findings = inspect(with_K(**entries), HEIGHT, WIDTH)
+    assert [f.severity for f in findings] == [severity]
+    assert words in str(findings[0]) and "view 1" in findings[0].where
+
+
+@pytest.mark.parametrize(
+    ("entries", "severity", "words"),
+    [
+        ({"fx": 0.9, "fy": 1.1, "cx": 0.5, "cy": 0.5}, "error", "looks normalised"),
+        ({"cx": 80.0, "cy": 48.0}, "error", "for about 160 x 96"),
+        ({"cx": -3.0}, "error", "outside"),
+        ({"cx": 10.0, "cy": 6.0}, "warning", "for a picture of 20 x 12"),
+    ],
+)
+def test_intrinsics_for_another_picture(entries, severity, words):
+    _, findings = inspect(with_K(**entries), HEIGHT, WIDTH)
+    assert [f.severity for f in findings] == [severity] and words in str(findings[0])
+    if severity == "error":
+        with pytest.raises(UserError, match="view 1"):
+            check_cameras(with_K(**entries))
+
+
+def test_wide_views():
+    """Pinhole rays stay valid below 180 degrees; above 120 there is a warning."""
+    cameras = with_K(fx=8.0, fy=8.0)
+    with pytest.warns(CameraWarning, match="field of view 136"):
+        check_cameras(cameras)
+    rays = np.asarray(plucker(cameras.K, cameras.c2w, HEIGHT, WIDTH))
+    np.testing.assert_allclose(np.linalg.norm(rays[..., :3], axis=-1), 1.0, atol=1e-6)
+
+
+@few
+@given(seeds)
+def test_skewed_and_off_centre_intrinsics(seed):
+    """The full inverse of K: K d is proportional to the pixel to 1e-6."""
+    rng = np.random.default_rng(seed)
+    K = random_K(rng, HEIGHT, WIDTH, skew=rng.uniform(-0.5, 0.5))[None]
+    d = np.asarray(plucker(K, np.eye(4)[None], HEIGHT, WIDTH), np.float64)[0, ..., :3]
+    pixels = d @ K[0].T
+    pixels = pixels[..., :2] / pixels[..., 2:]
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    np.testing.assert_allclose(pixels / WIDTH, np.stack([x, y], -1) / WIDTH, atol=2e-6)
+    inspected = inspect(Cameras(K, np.eye(4)[None]), HEIGHT, WIDTH)[1]
+    assert not [f for f in inspected if f.severity == "error"]
+
+
+@few
+@given(seeds, st.sampled_from([(16, 16), (48, 80), (7, 31), (24, 11)]))
+def test_cropping_commutes_with_projection(seed, size):
+    """Points projected with the new K are the old pixels, cropped and scaled (1e-9)."""
+    rng = np.random.default_rng(seed)
+    cameras = random_cameras(rng, 1, HEIGHT, WIDTH, skew=0.1)
+    points = rng.normal(size=(20, 3)) * 3
+    before, _, visible = project(cameras.K[0], cameras.c2w[0], points)
+    K = crop_resize_K(cameras.K[0], (HEIGHT, WIDTH), size)
+    after, _, _ = project(K, cameras.c2w[0], points)
+    corners = np.array([[0.0, 0.0], [1.0, 1.0]])
+    inverse = np.linalg.inv(K @ np.linalg.inv(cameras.K[0]))
+    window = corners * size[::-1] @ inverse[:2, :2].T + inverse[:2, 2]
+    wide = window[1] - window[0]
+    expected = (before - window[0]) / wide * size[::-1]
+    np.testing.assert_allclose(after[visible], expected[visible], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(wide[0] / wide[1], size[1] / size[0], rtol=0.1)
+    assert (window[0] >= -1e-9).all() and (window[1] <= np.array([WIDTH, HEIGHT]) + 1e-9).all()
+
+
+@pytest.mark.parametrize("filter_of", ["opencv", "jax"])
+@pytest.mark.parametrize("size", [(16, 28), (12, 16), (48, 60)])
+def test_pixels_move_as_intrinsics_say(monkeypatch, filter_of, size):
+    """A picture of its own coordinates, cropped and resized: every colour is the coordinate that
+    the new intrinsics assign to that pixel, with either filter."""
+    if filter_of == "jax":
+        monkeypatch.setitem(sys.modules, "cv2", None)
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image = np.stack([x / WIDTH, y / WIDTH, 0 * x], -1).astype(np.float32)
+    small, K = crop_resize(image, np.eye(3), *size)
+    y, x = np.mgrid[: size[0], : size[1]] + 0.5
+    expected = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1]], -1) / WIDTH
+    inner = (slice(2, -2), slice(2, -2))
+    assert small.shape == (*size, 3) and small.dtype == np.float32
+    error = (small[..., :2] - expected)[inner] * WIDTH
+    # Cut pixels of a box filter count at their centre: up to 1/8 pixel, in both directions.
+    assert np.abs(error).max() < 0.126 and np.abs(error.mean((0, 1))).max() < 0.02
+
+
+def test_ray_through_the_principal_point():
+    """It is the third column of R, to the bit."""
+    cameras = some(3)
+    K = np.repeat(np.array([[[55.0, 7.0, 20.5], [0, 44.0, 9.5], [0, 0, 1]]]), 3, 0)
+    rays = np.asarray(plucker(K, cameras.c2w, HEIGHT, WIDTH))
+    expected = cameras.c2w[:, :3, 2].astype(np.float32)
+    np.testing.assert_array_equal(rays[:, 9, 20, :3], expected)
+
+
+# Projection and triangulation
+
+
+def test_points_behind_the_camera():
+    """Marked, never divided by their depth, and without gradients that are not numbers."""
+    K, c2w = jnp.asarray(with_K().K[0]), jnp.eye(4)
+    points = jnp.array([[0.0, 0.0, 0.0], [1.0, 1.0, -2.0], [1.0, 1.0, 0.0], [0.1, 0.2, 2.0]])
+
+    def loss(points):
+        pixels, _, visible = project(K, c2w, points)
+        return jnp.sum(pixels**2), visible
+
+    (value, visible), gradient = jax.value_and_grad(loss, has_aux=True)(points)
+    assert visible.tolist() == [False, False, False, True]
+    assert np.isfinite(value) and np.isfinite(gradient).all()
+    assert not np.any(gradient[:3]) and np.any(gradient[3])
+
+
+def test_nearly_parallel_rays():
+    """Below one degree a point is at infinity; distances stay exact for parallel lines."""
+    centres = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    for angle, expected in ((0.0, False), (0.5, False), (2.0, True)):
+        tilt = np.radians(angle)
+        d = np.array([[0.0, 0.0, 1.0], [-np.sin(tilt), 0.0, np.cos(tilt)]])
+        lines = np.concatenate([d, np.cross(centres, d)], -1)
+        point, finite = triangulate(lines[0], lines[1])
+        assert finite == expected and np.isfinite(point).all()
+    parallel = np.concatenate([d[:1], np.cross(centres[1:], d[:1])], -1)[0]
+    np.testing.assert_allclose(ray_distance(lines[0], parallel), 1.0, atol=1e-12)
+    opposite = np.concatenate([-parallel[:3], -parallel[3:]])
+    np.testing.assert_allclose(ray_distance(lines[0], opposite), 1.0, atol=1e-12)
+
+
+# Gauge
+
+
+def test_map_coordinates():
+    """5,000,000 m from the origin: the same rays to 1e-5, where float32 poses would be 0.1 off."""
+    every = some(5)
+    far = moved(every, offset=5e6)
+    assert_same_inputs(
+        network_inputs(far[:3], far[3:]), network_inputs(every[:3], every[3:]), tolerance=1e-5
+    )
+    rounded = Cameras(far.K, far.c2w.astype(np.float32))
+    gap = network_inputs(rounded[:3], rounded[3:])[1] - network_inputs(every[:3], every[3:])[1]
+    assert np.abs(gap).max() > 0.05  # the test can see what it guards against
+
+
+@few
+@given(seeds, st.floats(-6.0, 6.0))
+def test_unit_of_the_scene(seed, power):
+    every = some(5, seed)
+    other = moved(every, scale=10.0**power)
+    assert_same_inputs(
+        network_inputs(other[:3], other[3:]), network_inputs(every[:3], every[3:]), tolerance=2e-6
+    )
+
+
+@few
+@given(seeds)
+def test_world_frame_of_the_scene(seed):
+    every = some(5, seed)
+    other = moved(every, random_rigid(np.random.default_rng(seed + 1)))
+    assert_same_inputs(
+        network_inputs(other[:3], other[3:]), network_inputs(every[:3], every[3:]), tolerance=2e-6
+    )
+
+
+def test_order_of_contexts():
+    """With the first view fixed the others permute: same divisor, permuted rays and slots; another
+    first view changes the frame by one rigid motion, not the divisor's rule."""
+    every = some(6)
+    order = [0, 2, 3, 1]
+    swapped = Cameras(every.K[[*order, 4, 5]], every.c2w[[*order, 4, 5]])
+    vector, rays, _ = network_inputs(every[:4], every[4:])
+    other_vector, other_rays, _ = network_inputs(swapped[:4], swapped[4:])
+    np.testing.assert_array_equal(other_vector, vector[order])
+    np.testing.assert_array_equal(other_rays[:4], rays[:4][order])
+    np.testing.assert_array_equal(other_rays[4:], rays[4:])
+    slots, other_slots = pack_views(rays[:5], 4), pack_views(other_rays[:5], 4)
+    np.testing.assert_array_equal(other_slots[:4], slots[:4][order])
+    np.testing.assert_array_equal(other_slots[4], slots[4])
+
+
+# Photos
+
+
+def test_photos_of_different_size():
+    """Each K follows its own photo to the common size; wildly different shapes are refused."""
+    images = [np.zeros((24, 40, 3), np.float32), np.zeros((60, 80, 3), np.float32)]
+    K = with_K().K
+    K[1] = scale_K(K[0], (24, 40), (60, 80))
+    scene = Scene(images, Cameras(K, some(2).c2w), ("a", "b"), "test")
+    pictures, cameras = prepare(scene, [0, 1], 12, 16)
+    assert pictures.shape == (2, 12, 16, 3)
+    for view in range(2):
+        expected = crop_resize_K(K[view], images[view].shape[:2], (12, 16))
+        np.testing.assert_array_equal(cameras.K[view], expected)
+    tall = Scene([images[0], np.zeros((80, 40, 3))], scene.cameras, ("a", "b"), "test")
+    with pytest.raises(UserError, match=r"photos a and b differ by more than a factor of two"):
+        prepare(tall, [0, 1], 12, 16)
+
+
+def stored_with_tag(upright: np.ndarray, orientation: int) -> tuple[np.ndarray, object]:
+    """The grid on which a camera with this EXIF orientation stores an upright picture."""
+    from PIL import Image
+
+    back = {1: 0, 2: 0, 3: 2, 4: 2, 5: 3, 6: 1, 7: 1, 8: 3}[orientation]
+    stored = np.rot90(upright, back)
+    stored = stored[:, ::-1] if orientation in (2, 4, 5, 7) else stored
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    return np.ascontiguousarray(stored), exif
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation(tmp_path, orientation):
+    """Photos are shown upright; K for the upright grid stays, K for the stored grid turns along
+    with picture and pose."""
+    from PIL import Image, ImageOps
+
+    truth = with_K(cx=17.0, cy=14.0, fy=37.0)[[1]]
+    folder = files.nerfstudio(tmp_path / "upright", truth)
+    upright = picture(0)
+    stored, exif = stored_with_tag(upright, orientation)
+    files.save(folder / "images" / "0000.png", stored, exif=exif)
+    with Image.open(folder / "images" / "0000.png") as shown:
+        np.testing.assert_array_equal(np.asarray(ImageOps.exif_transpose(shown)), upright)
+    deep = _upright(stored, orientation)
+    np.testing.assert_array_equal(deep, upright)
+    scene = load_scene(folder)
+    np.testing.assert_allclose(scene.images[0] * 255, upright, atol=1e-4)
+    np.testing.assert_allclose(scene.cameras.K, truth.K)
+    ignored = load_scene_ignoring(folder, stored)
+    assert ignored.sizes == [stored.shape[:2]]
+
+    if orientation in (6, 8):
+        turns = {6: 1, 8: 3}[orientation]
+        K, c2w = turn(truth.K[0], truth.c2w[0], turns, HEIGHT, WIDTH)
+        other = files.nerfstudio(
+            tmp_path / "stored", Cameras(K[None], c2w[None]), w=HEIGHT, h=WIDTH
+        )
+        files.save(other / "images" / "0000.png", stored, exif=exif)
+        scene = load_scene(other)
+        np.testing.assert_allclose(scene.images[0] * 255, upright, atol=1e-4)
+        np.testing.assert_allclose(scene.cameras.K, truth.K, atol=1e-9)
+        np.testing.assert_allclose(scene.cameras.c2w, truth.c2w, atol=1e-9)
+
+
+def load_scene_ignoring(folder, stored: np.ndarray) -> Scene:
+    """The stored grid as it is, with a K for it."""
+    content = json.loads((folder / "transforms.json").read_text())
+    height, width = stored.shape[:2]
+    content |= {"w": width, "h": height}
+    content["frames"][0] |= {"cx": width / 2, "cy": height / 2}
+    other = folder / "ignored.json"
+    other.write_text(json.dumps(content))
+    scene = load_scene(other, exif="ignore")
+    np.testing.assert_allclose(scene.images[0] * 255, stored, atol=1e-4)
+    return scene
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_turned_cameras_see_the_same_rays(turns):
+    """np.rot90 on the picture and `turn` on the camera permute the rays, nothing else."""
+    camera = with_K(cx=17.0, cy=14.0, fy=37.0)[[1]]
+    before = plucker_float64(camera.K, camera.c2w, HEIGHT, WIDTH)[0]
+    K, c2w = turn(camera.K[0], camera.c2w[0], turns, HEIGHT, WIDTH)
+    size = (WIDTH, HEIGHT) if turns % 2 else (HEIGHT, WIDTH)
+    after = plucker_float64(K[None], c2w[None], *size)[0]
+    np.testing.assert_allclose(after, np.rot90(before, turns), atol=1e-12)
+    assert not inspect(Cameras(K[None], c2w[None]), *size)[1]
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "LA", "P"])
+def test_transparent_photos(tmp_path, mode):
+    """Composited once on white (or the colour asked for), with a warning."""
+    from PIL import Image
+
+    rgba = np.zeros((HEIGHT, WIDTH, 4), np.uint8)
+    rgba[..., :3], rgba[: HEIGHT // 2, :, 3] = 100, 255
+    rgba[0, 0, 3] = 51 if mode != "P" else 255
+    image = Image.fromarray(rgba)
+    file = tmp_path / "a.png"
+    if mode == "P":
+        flat = Image.fromarray((rgba[..., 3] == 0).astype(np.uint8), "L").convert("P")
+        flat.putpalette([100, 100, 100] + [0, 0, 0] * 255)
+        flat.save(file, transparency=1)
+    else:
+        image.convert(mode).save(file)
+    pixels = read_image(file)
+    assert pixels.shape == (HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(pixels[-1], 1.0)
+    np.testing.assert_allclose(pixels[1], 100 / 255, atol=1e-6)
+    if mode != "P":
+        np.testing.assert_allclose(pixels[0, 0], 0.2 * 100 / 255 + 0.8, atol=1e-6)
+    np.testing.assert_allclose(read_image(file, background=0.0)[-1], 0.0)
+    folder = files.nerfstudio(tmp_path, with_K()[:1])
+    file.rename(folder / "images" / "0000.png")
+    with pytest.warns(CameraWarning, match="transparent"):
+        load_scene(folder)
+
+
+def test_sixteen_bits(tmp_path):
+    """All 65536 levels survive; grey becomes three equal channels; alpha still counts."""
+    import cv2
+
+    ramp = np.arange(65536, dtype=np.uint16).reshape(256, 256)
+    colour = np.stack([ramp, ramp[::-1], ramp[:, ::-1]], -1)  # blue, green, red in OpenCV's order
+    cv2.imwrite(str(tmp_path / "colour.png"), colour)
+    cv2.imwrite(str(tmp_path / "grey.png"), ramp)
+    cv2.imwrite(str(tmp_path / "colour.tif"), colour)
+    for name in ("colour.png", "colour.tif"):
+        expected = colour[..., ::-1].astype(np.float32) / np.float32(65535)
+        np.testing.assert_array_equal(read_image(tmp_path / name), expected)
+    grey = read_image(tmp_path / "grey.png")
+    assert len(np.unique(grey)) == 65536 and grey.shape == (256, 256, 3)
+    alpha = np.concatenate([colour, np.zeros_like(colour[..., :1])], -1)
+    cv2.imwrite(str(tmp_path / "alpha.png"), alpha)
+    np.testing.assert_array_equal(read_image(tmp_path / "alpha.png"), 1.0)
+    (tmp_path / "hdr.exr").write_bytes(b"v/1\x01")
+    with pytest.raises(UserError, match=r"hdr.exr: HDR .* tone-map"):
+        read_image(tmp_path / "hdr.exr")
+    cv2.imwrite(str(tmp_path / "float.tif"), ramp.astype(np.float32))
+    with pytest.raises(UserError, match=r"float.tif: float32 pixels"):
+        read_image(tmp_path / "float.tif")
+
+
+def test_colour_modes(tmp_path):
+    """Grey is repeated, CMYK without a profile refused, another colour space converted to sRGB."""
+    from PIL import Image, ImageCms
+
+    grey = Image.fromarray(picture(0)[..., 0])
+    grey.save(tmp_path / "grey.jpg", quality=100)
+    pixels = read_image(tmp_path / "grey.jpg")
+    assert pixels.shape[-1] == 3 and np.ptp(pixels, axis=-1).max() == 0
+    Image.fromarray(picture(0)).convert("CMYK").save(tmp_path / "cmyk.jpg")
+    with pytest.raises(UserError, match=r"cmyk.jpg: CMYK without a colour profile"):
+        read_image(tmp_path / "cmyk.jpg")
+    srgb = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+    Image.fromarray(picture(0)).save(tmp_path / "srgb.png", icc_profile=srgb)
+    np.testing.assert_allclose(read_image(tmp_path / "srgb.png") * 255, picture(0), atol=1e-4)
+    corners = np.array([[[255, 0, 0], [0, 255, 0], [0, 0, 255], [255, 255, 0]]], np.uint8)
+    Image.fromarray(corners).save(tmp_path / "swap.png", icc_profile=swapped_profile())
+    pixels = read_image(tmp_path / "swap.png") * 255
+    np.testing.assert_allclose(pixels, corners[..., [1, 0, 2]], atol=12)
+
+
+def swapped_profile() -> bytes:
+    """An ICC profile of sRGB's primaries with red and green exchanged (ICC.1:2001, matrix type)."""
+
+    def fixed(*numbers: float) -> bytes:
+        return struct.pack(f">{len(numbers)}i", *(round(n * 65536) for n in numbers))
+
+    red, green, blue = (0.4361, 0.2225, 0.0139), (0.3851, 0.7169, 0.0971), (0.1431, 0.0606, 0.7141)
+    name = b"swapped\0"
+    about = b"desc" + bytes(4) + struct.pack(">I", len(name)) + name + bytes(4 + 4 + 2 + 1 + 67)
+    tags = {b"desc": about, b"cprt": b"text" + bytes(4) + b"none\0"}
+    tags[b"wtpt"] = b"XYZ " + bytes(4) + fixed(0.9642, 1.0, 0.8249)
+    for tag, primary in zip((b"rXYZ", b"gXYZ", b"bXYZ"), (green, red, blue), strict=True):
+        tags[tag] = b"XYZ " + bytes(4) + fixed(*primary)
+    for tag in (b"rTRC", b"gTRC", b"bTRC"):
+        tags[tag] = b"curv" + bytes(4) + struct.pack(">IH", 1, round(2.2 * 256)) + bytes(2)
+    at, table, body = 128 + 4 + 12 * len(tags), struct.pack(">I", len(tags)), b""
+    for tag, content in tags.items():
+        table += tag + struct.pack(">II", at + len(body), len(content))
+        body += content + bytes(-len(content) % 4)
+    header = struct.pack(
+        ">I4sI4s4s4s", at + len(body), b"none", 0x02200000, b"mntr", b"RGB ", b"XYZ "
+    )
+    header += struct.pack(">6H", 2024, 1, 1, 0, 0, 0) + b"acsp"
+    header = header.ljust(68, b"\0") + fixed(0.9642, 1.0, 0.8249)
+    return header.ljust(128, b"\0") + table + body
+
+
+def test_damaged_photos(tmp_path):
+    """Cut off or foreign files are refused by name; no half picture comes out."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.fromarray(picture(0, 200, 300)).save(stream, "JPEG")
+    (tmp_path / "cut.jpg").write_bytes(stream.getvalue()[: len(stream.getvalue()) // 2])
+    (tmp_path / "text.png").write_text("not a picture")
+    (tmp_path / "empty.png").write_bytes(b"")
+    with pytest.raises(UserError, match=r"cut.jpg: damaged or truncated"):
+        read_image(tmp_path / "cut.jpg")
+    for name in ("text.png", "empty.png"):
+        with pytest.raises(UserError, match=rf"{name}: not a readable picture"):
+            read_image(tmp_path / name)
+    with pytest.raises(UserError, match=r"gone.png: there is no such picture"):
+        read_image(tmp_path / "gone.png")
+
+
+def test_resize_keeps_what_fits():
+    image = picture(0)
+    np.testing.assert_array_equal(resize(image, HEIGHT, WIDTH), image.astype(np.float32) / 255)
