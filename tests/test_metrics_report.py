@@ -36,6 +36,15 @@ def test_document_has_the_contracted_shape_and_plain_means():
     assert list(out["differences"]) == ["generated"]
 
 
+def test_wins_know_what_better_means():
+    scenes = [
+        entry("a", generated={"sharpness_ratio": 0.9}, plane={"sharpness_ratio": 1.3}),
+        entry("b", generated={"sharpness_ratio": 0.5}, plane={"sharpness_ratio": 0.8}),
+    ]
+    assert report.paired_difference(scenes, "generated", "plane", "sharpness_ratio")["wins"] == 0.5
+    assert report.goodness("lpips_vgg", 0.1) > report.goodness("lpips_vgg", 0.2)
+
+
 def test_bootstrap_covers_the_true_mean_as_often_as_it_says():
     rng = np.random.default_rng(0)
     hits = 0

@@ -227,10 +227,8 @@ def plane_sweep(
         return Sweep(float("inf"), 0.0, float("nan"))
     best_overlap = max(overlap for _, overlap, _ in found)
     limit = min_overlap if best_overlap >= min_overlap else 0.75 * best_overlap
-    depth, overlap, score = min(
-        (one for one in found if one[1] >= limit), key=lambda candidate: candidate[2]
-    )
-    return Sweep(depth, overlap, float(np.sqrt(2.0 * score)))
+    best = min((one for one in found if one[1] >= limit), key=lambda candidate: candidate[2])
+    return Sweep(best[0], best[1], float(np.sqrt(2.0 * best[2])))
 
 
 def baselines(

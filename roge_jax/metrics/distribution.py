@@ -117,8 +117,8 @@ def _narrow(A: np.ndarray, B: np.ndarray) -> np.ndarray:
     """A B^T, or a smaller matrix with the same singular values when samples outnumber features."""
     d = A.shape[1]
     # A = Q R leaves the singular values of A B^T = Q (R S^T) P^T unchanged
-    A = np.linalg.qr(A, mode="r") if len(A) > d else A
-    B = np.linalg.qr(B, mode="r") if len(B) > d else B
+    A = np.asarray(np.linalg.qr(A, mode="r")) if len(A) > d else A
+    B = np.asarray(np.linalg.qr(B, mode="r")) if len(B) > d else B
     return A @ B.T
 
 

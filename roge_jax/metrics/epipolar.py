@@ -138,7 +138,7 @@ def sift_matches(image_i: np.ndarray, image_j: np.ndarray, *, ratio: float = RAT
     """
     import cv2
 
-    sift = cv2.SIFT_create(edgeThreshold=EDGE_THRESHOLD)
+    sift = cv2.SIFT.create(edgeThreshold=EDGE_THRESHOLD)
     found = []
     for image in (image_i, image_j):
         grey = cv2.cvtColor(_bytes(image), cv2.COLOR_RGB2GRAY)
@@ -185,7 +185,9 @@ def tsed(
     scale = side / min(h, w)
     new_h, new_w = round(h * scale), round(w * scale)
     how = cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC
-    resized = [cv2.resize(np.float32(f), (new_w, new_h), interpolation=how) for f in frames]
+    resized = [
+        cv2.resize(np.asarray(f, np.float32), (new_w, new_h), interpolation=how) for f in frames
+    ]
     K = np.diag([new_w / w, new_h / h, 1.0]) @ K  # pixel edges stay at 0 and the new width
     matches = [sift_matches(a, b) for a, b in itertools.pairwise(resized)]
     result = tsed_from_matches(

@@ -232,7 +232,7 @@ def read_tensors(path: Path) -> dict[str, np.ndarray]:
         from safetensors.numpy import load_file
 
         try:
-            return {name: np.float32(x) for name, x in load_file(path).items()}
+            return {name: np.asarray(x, np.float32) for name, x in load_file(path).items()}
         except SafetensorError as error:
             raise UserError(f"{path} is not a complete safetensors file ({error}).") from error
     try:
@@ -243,7 +243,7 @@ def read_tensors(path: Path) -> dict[str, np.ndarray]:
         ) from error
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        return {name: np.float32(x.numpy()) for name, x in state.items()}
+        return {name: np.asarray(x.numpy(), np.float32) for name, x in state.items()}
     except Exception as error:  # torch raises whatever its unpickler met
         raise UserError(
             f"{path} cannot be read as a PyTorch file of tensors ({type(error).__name__}); fetch it again."

@@ -48,6 +48,13 @@ def bootstrap(
     return {"mean": float(x.mean()), "low": float(low), "high": float(high), "n": len(x)}
 
 
+def goodness(metric: str, value: float) -> float:
+    """A number that is higher for better values: ratios are best at 1, errors at 0."""
+    if metric == "sharpness_ratio":
+        return -abs(math.log(max(value, 1e-9)))
+    return -value if metric in LOWER_IS_BETTER else value
+
+
 def values(scenes: Sequence[dict[str, Any]], method: str, metric: str) -> dict[str, float]:
     """{scene name: value} of the scenes where `method` has a finite `metric`."""
     found = {}
@@ -70,15 +77,15 @@ def paired_difference(
 ) -> dict[str, float]:
     """`bootstrap` of method - baseline over the scenes that have both, and `wins`.
 
-    `wins` is the share of those scenes where the method is better (higher, or lower for the metrics in
-    LOWER_IS_BETTER). The scenes' own difficulty cancels: this interval, not the overlap of two
+    `wins` is the share of those scenes where the method is better (see `goodness`). The scenes' own difficulty cancels: this interval, not the overlap of two
     intervals of means, says whether one method beats the other.
     """
     a, b = values(scenes, method, metric), values(scenes, baseline, metric)
-    difference = np.array([a[name] - b[name] for name in a if name in b])
-    sign = -1.0 if metric in LOWER_IS_BETTER else 1.0
-    result = bootstrap(difference.tolist(), seed=seed, resamples=resamples, level=level)
-    result["wins"] = float(np.mean(sign * difference > 0.0)) if len(difference) else math.nan
+    both = [name for name in a if name in b]
+    difference = [a[name] - b[name] for name in both]
+    result = bootstrap(difference, seed=seed, resamples=resamples, level=level)
+    won = [goodness(metric, a[name]) > goodness(metric, b[name]) for name in both]
+    result["wins"] = float(np.mean(won)) if won else math.nan
     return result
 
 
@@ -168,12 +175,7 @@ def table(results: dict[str, Any], metrics: Sequence[str] | None = None) -> str:
             for m, v in intervals.items()
             if metric in v and math.isfinite(v[metric]["mean"])
         }
-        # nearest to 1 for a ratio, else lowest or highest
-        key = {
-            "sharpness_ratio": lambda value: -abs(math.log(max(value, 1e-9))),
-            **dict.fromkeys(LOWER_IS_BETTER, lambda value: -value),
-        }.get(metric, lambda value: value)
-        best[metric] = max(means, key=lambda m, key=key, means=means: key(means[m]), default=None)
+        best[metric] = max(means, key=lambda m: goodness(metric, means[m]), default=None)
     for m, found in intervals.items():
         cells = [
             _cell(found.get(metric), scenes) + ("*" if best[metric] == m else " ")
