@@ -141,7 +141,8 @@ def _read_deep(file: Path) -> np.ndarray:
         raise UserError(f"{file}: damaged or truncated picture.")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{file}: {pixels.dtype} pixels: convert it to an 8 or 16 bit PNG first.")
-    pixels = pixels.astype(np.float32) / np.float32(np.iinfo(pixels.dtype).max)
+    white = np.float32(255 if pixels.dtype == np.uint8 else 65535)
+    pixels = np.asarray(pixels, np.float32) / white
     pixels = pixels[..., None] if pixels.ndim == 2 else pixels
     if pixels.shape[-1] == 1:
         return np.repeat(pixels, 3, -1)

@@ -19,7 +19,7 @@ def matched_pixels(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """
     import cv2
 
-    sift = cv2.SIFT_create(2000)
+    sift = cv2.SIFT_create(2000)  # type: ignore[attr-defined]
     found = []
     for image in (a, b):
         grey = cv2.cvtColor((image * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)

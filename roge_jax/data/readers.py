@@ -109,6 +109,8 @@ def _nerfstudio_camera(
 ) -> tuple[np.ndarray, tuple[int, int] | None, Lens | None]:
     """K, the size it is for and the lens, from a frame's fields laid over the file's."""
     size = (int(fields["h"]), int(fields["w"])) if "h" in fields and "w" in fields else None
+    if size is not None and min(size) < 1:
+        raise UserError(f"{where}: 'w' x 'h' is {size[1]} x {size[0]}: give the size in pixels.")
     model = str(fields.get("camera_model", "OPENCV")).upper()
     numbers = {}
     for name in (

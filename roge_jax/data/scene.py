@@ -124,29 +124,28 @@ def _assemble(frames: list[Frame], source: str, exif: str, background: float) ->
 
     for frame in frames:
         header = read_header(frame.file)
+        use_tag, turns = _orientation(header, frame, exif)
+        size = header.displayed if use_tag else header.stored
+        K, pose = _fit_K(frame, size), frame.c2w
+        photo = Photo(frame.file, size, use_tag, turns, background=background)
+        if frame.lens is not None and np.isfinite(K).all():
+            new_K = ideal_K(K, frame.lens, size)
+            photo = dataclasses.replace(photo, lens=frame.lens, K=K, new_K=new_K)
+            K = new_K
+            note("note", f"photos have {frame.lens.model} lens distortion", "it is removed")
+        if turns:
+            K, pose = turn(K, pose, turns, *size)
+            upright = size[::-1] if turns % 2 else size
+            photo = dataclasses.replace(photo, size=upright)
         if header.alpha:
             note("warning", "photos are transparent", f"they show background {background:g} there")
-        use_tag, turns = _orientation(header, frame, exif)
         if header.orientation != 1:
             note("note", "photos carry an EXIF orientation", "see docs/cameras.md if they lie down")
-        size = header.displayed if use_tag else header.stored
-        K = _fit_K(frame, size)
         if frame.size not in (None, size, (1, 1)):
             what = f"intrinsics are for {frame.size[1]} x {frame.size[0]} pixels"
             note("note", what, f"they are scaled to the photos, {size[1]} x {size[0]}")
-        lens, new_K = frame.lens, None
-        pose = frame.c2w
-        turned, upright = K, size
-        if lens is not None and np.isfinite(K).all():
-            turned = new_K = ideal_K(K, lens, size)
-            note("note", f"photos have {lens.model} lens distortion", "it is removed")
-        if turns:
-            turned, pose = turn(turned, pose, turns, *size)
-            upright = size[::-1] if turns % 2 else size
-        lens_K = None if new_K is None else K
-        lens = None if new_K is None else lens
-        photos.append(Photo(frame.file, upright, use_tag, turns, lens, lens_K, new_K, background))
-        Ks.append(turned)
+        photos.append(photo)
+        Ks.append(K)
         poses.append(pose)
     names = tuple(frame.file.name for frame in frames)
     cameras = Cameras(np.stack(Ks), np.stack(poses))
@@ -273,7 +272,7 @@ def prepare(
     return pictures, cameras
 
 
-def distinct_views(images: Sequence[np.ndarray], cameras: Cameras) -> list[int]:
+def distinct_views(images: Sequence[np.ndarray] | np.ndarray, cameras: Cameras) -> list[int]:
     """Indices of the views left when of views with equal pose, K and pixels the first is kept."""
     cameras = to_host(cameras)
     kept: list[int] = []

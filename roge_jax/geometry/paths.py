@@ -161,12 +161,12 @@ def _entries(content: dict, file: Path) -> tuple[list[dict], str, str]:
     else:
         entries = content.get("frames", content.get("keyframes"))
         foreign = isinstance(entries, list) and entries and "transform_matrix" in entries[0]
-        field, default = ("transform_matrix", "opengl") if foreign else ("pose", None)
+        field, default = ("transform_matrix", "opengl") if foreign else ("pose", "")
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
-    convention = content.get("convention", default)
+    convention = content.get("convention") or default
     if convention not in CONVENTIONS:
-        given = "no 'convention'" if convention is None else f"convention '{convention}'"
+        given = f"convention '{convention}'" if convention else "no 'convention'"
         hint = did_you_mean(str(convention), CONVENTIONS)
         raise UserError(f"{file}: {given}, so its axes are unknown: {hint}")
     return entries, field, convention
@@ -231,9 +231,11 @@ def _intrinsics(
         middle = (0.0, 0.0) if size is None else (size[1] / 2, size[0] / 2)
         cx, cy = float(source.get("cx", middle[0])), float(source.get("cy", middle[1]))
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    if target is not None and size is None:
+    if target is None:
+        return K
+    if size is None:
         raise UserError(f"{where}: K needs the picture size it is for: give 'height' and 'width'.")
-    return K if target is None or size == target else crop_resize_K(K, size, target)
+    return K if size == target else crop_resize_K(K, size, target)
 
 
 def _times(entries: list[dict], file: Path) -> np.ndarray | None:
