@@ -80,8 +80,6 @@ class DiTConfig:
 @dataclass(frozen=True)
 class FusionConfig:
     geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
-    context_rope: Literal["none", "shared"] = "none"  # temporal rotation on context slots
-    target_appearance: Literal["zeros", "grey"] = "zeros"  # condition latents of target slots
 
 
 @dataclass(frozen=True)
@@ -97,9 +95,7 @@ class LoraConfig:
     dit_rank: int = 32
     dit_match: str = r"blocks/.*(self_attn|cross_attn)/(q|k|v|o)$|blocks/.*ffn/(fc1|fc2)$"
     recon_rank: int = 8
-    recon_match: str = (
-        r"(frame_blocks|global_blocks|blocks|last_block|camera_mlp)/|connector$|ray_embed$|rgb_head/linear$"
-    )
+    recon_match: str = r"^(?!encoder/patch_encoder/patch_embed$)"  # every linear and the ray convolution
 
 
 @dataclass(frozen=True)
@@ -185,10 +181,10 @@ def _mini() -> RoGeConfig:
         frames=17,
         max_context=6,
         encoder=EncoderConfig(
-            patch=8, width=256, heads=4, depth=3, dino_depth=0, long_side=None, relative_cameras=True
+            patch=8, width=192, heads=4, depth=3, dino_depth=0, long_side=None, relative_cameras=True
         ),
         renderer=RendererConfig(
-            width=256, heads=4, depth=6, attention="cross", relative_cameras=True, chunk=32
+            width=192, heads=4, depth=6, attention="cross", relative_cameras=True, chunk=32
         ),
         vae=VAEConfig(base=16),
         dit=DiTConfig(

@@ -13,10 +13,11 @@ itself). A scene's `views` are a dict of arrays, contexts first:
 
 import re
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from . import fusion
 from .config import RoGeConfig
@@ -27,7 +28,7 @@ from .fusion import Condition
 from .geometry.rays import plucker
 from .recon import ray_scene, vggt
 from .recon.relative import Relative, relative_cameras
-from .video import dit, flow, vae
+from .video import dit, flow, solvers, vae
 
 ContextSlots = Literal["noised", "clean", "free"]
 Views = dict[str, jax.Array]
@@ -104,8 +105,20 @@ def reconstruct(params: Tree, views: Views, *, config: RoGeConfig) -> jax.Array:
     )
 
 
-def query_rays(params: Tree, scene_tokens: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
-    """Ray features Phi [v, gh, gw, d] of all views in `views` (contexts and targets)."""
+def query_rays(
+    params: Tree,
+    scene_tokens: jax.Array,
+    views: Views,
+    *,
+    config: RoGeConfig,
+    context: Views | None = None,
+) -> jax.Array:
+    """Ray features Phi [v, gh, gw, d] of all views in `views`: contexts and targets, contexts first.
+
+    To ask for other views than those (targets alone, say), give them as `views` and the ones that the scene tokens
+    were made of as `context`; a shared refinement, which needs the rays of the contexts, cannot do that.
+    """
+    assert context is None or config.renderer.refinement == "per_view"
     cfg, size = config.renderer, (config.recon_height, config.recon_width)
     K, c2w = recon_cameras(views, config)
     rays: Relative | None = None
@@ -117,9 +130,10 @@ def query_rays(params: Tree, scene_tokens: jax.Array, views: Views, *, config: R
         rays = relative_cameras(
             K, c2w, size, grid=grid, specials=cfg.registers, head_dim=head_dim
         )
+        seen_K, seen_c2w = recon_cameras(context or views, config)
         cameras = relative_cameras(
-            K[:m],
-            c2w[:m],
+            seen_K[:m],
+            seen_c2w[:m],
             size,
             grid=vggt.encoder_grid(config.encoder, *size),
             specials=0,
@@ -166,6 +180,14 @@ def condition(
     m = context_latents.shape[0]
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
     return fusion.condition(params["fusion"], context_latents, rays, features, m)
+
+
+def unconditioned(context_latents: jax.Array, slots: int, *, config: RoGeConfig) -> Condition:
+    """The condition of the generation-only model: appearance, but neither rays nor geometry."""
+    lh, lw = config.latent_size
+    tokens = slots * (lh // config.dit.patch) * (lw // config.dit.patch)
+    known = fusion.appearance(context_latents, slots)
+    return Condition(known, jnp.zeros((tokens, config.dit.width)))
 
 
 def velocity(
@@ -314,3 +336,59 @@ def context_projection(x0: jax.Array, noise: jax.Array, mode: ContextSlots) -> C
         return jnp.concatenate([known, x[m:]])
 
     return project
+
+
+class Prepared(NamedTuple):
+    """All that sampling needs and that no noise level changes; computed once per window."""
+
+    context_latents: jax.Array  # [m, lh, lw, 16]
+    features: jax.Array  # [m + n, gh, gw, d]
+    condition: Condition
+    text: Tree | None
+
+
+def prepare(
+    params: Tree, views: Views, *, config: RoGeConfig, scene_tokens: jax.Array | None = None
+) -> Prepared:
+    """Reconstruct, query the rays of all views, encode the photos. `scene_tokens`: reuse those of the same photos."""
+    if scene_tokens is None:
+        scene_tokens = reconstruct(params, views, config=config)
+    features = query_rays(params, scene_tokens, views, config=config)
+    latents = encode_contexts(params, views["context_rgb"], config=config)
+    cond = condition(params, latents, features, views, config=config)
+    return Prepared(latents, features, cond, text_cache(params, config=config))
+
+
+def draw_noise(key: jax.Array, contexts: int, *, config: RoGeConfig) -> jax.Array:
+    """Gaussian noise for all latent slots of a window [m + 1 + (n - 1) / 4, lh, lw, 16]."""
+    return jax.random.normal(key, (config.slots(contexts), *config.latent_size, config.vae.latent))
+
+
+def sampling_field(
+    params: Tree, prepared: Prepared, noise: jax.Array, *, config: RoGeConfig, mode: ContextSlots = "noised"
+) -> tuple[Callable, Callable | None]:
+    """(velocity(x, sigma), project(x, sigma) or None) for the functions of `video.solvers`."""
+    m = prepared.context_latents.shape[0]
+
+    def field(x, sigma):
+        return velocity(
+            params, x, sigma, prepared.condition, config=config, contexts=m, text=prepared.text
+        )
+
+    return field, context_projection(prepared.context_latents, noise, mode)
+
+
+def generate(
+    params: Tree,
+    prepared: Prepared,
+    noise: jax.Array,
+    *,
+    config: RoGeConfig,
+    solver: "str | solvers.Table" = "euler",
+    sigmas: np.ndarray | None = None,
+    mode: ContextSlots = "noised",
+) -> tuple[jax.Array, solvers.SolveInfo]:
+    """Integrate from noise to the target latents [t, lh, lw, 16]; context slots are dropped. Jit-able."""
+    field, project = sampling_field(params, prepared, noise, config=config, mode=mode)
+    x0, info = solvers.solve(solver, field, noise, sigmas, project=project)
+    return x0[prepared.context_latents.shape[0] :], info

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import UserError
 from ..geometry.cameras import Cameras, camera_vector, normalise
 
 
@@ -21,6 +22,7 @@ class ViewConfig:
     outside: float = 0.2  # probability that contexts surround the window instead of lying in it
     near: float = 0.4  # probability of drawing all views from a short stretch of the path
     augment: bool = True
+    size: tuple[int, int] | None = None  # height, width; None: as stored
 
 
 def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):
@@ -66,6 +68,21 @@ def alter(rng: np.random.Generator, rgb: np.ndarray, K: np.ndarray, c2w: np.ndar
     return np.clip(rgb, 0.0, 1.0) ** rng.uniform(0.7, 1.4), K, c2w
 
 
+def average_down(rgb: np.ndarray, K: np.ndarray, size: tuple[int, int] | None):
+    """uint8 frames [v, h, w, 3] to float32 in [0, 1] at `size` by averaging whole blocks; K [v, 3, 3] follows."""
+    x, K = rgb.astype(np.float32) / 255.0, np.asarray(K, np.float64)
+    v, h, w, c = x.shape
+    if size is None or size == (h, w):
+        return x, K
+    fy, fx = h // size[0], w // size[1]
+    if (fy * size[0], fx * size[1]) != (h, w):
+        raise UserError(
+            f"Frames of {h}x{w} cannot be averaged to {size[0]}x{size[1]}: render the pool at a multiple of it."
+        )
+    K = K * np.array([1 / fx, 1 / fy, 1.0])[None, :, None]
+    return x.reshape(v, size[0], fy, size[1], fx, c).mean((2, 4)), K
+
+
 def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray]:
     """Views [m + n] (contexts first) as the arrays the model takes, normalised to the first context.
 
@@ -86,18 +103,19 @@ def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray
 def draw_batch(pool, seed: int, index: int, batch: int, cfg: ViewConfig, *, scale_rule: str) -> dict:
     """Batch number `index`: arrays of `make_sample` with a leading batch axis; one M for the whole batch.
 
-    `pool` has `rgb` [s, f, h, w, 3] uint8, `K` [s, f, 3, 3] and `c2w` [s, f, 4, 4].
+    `pool[i]` is a sequence: `rgb` [f, h, w, 3] uint8, `K` [f, 3, 3], `c2w` [f, 4, 4]; frames are averaged down to
+    `cfg.size`, of which their size must be a multiple.
     """
     rng = np.random.default_rng([seed, index])
     weights = np.asarray(cfg.context_weights) / sum(cfg.context_weights)
     m = int(rng.choice(cfg.contexts, p=weights))
     samples = []
     for _ in range(batch):
-        scene = int(rng.integers(len(pool.rgb)))
-        contexts, targets = draw_views(rng, pool.rgb.shape[1], m, cfg)
+        sequence = pool[int(rng.integers(len(pool)))]
+        contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
         views = np.concatenate([contexts, targets])
-        rgb = pool.rgb[scene][views].astype(np.float32) / 255.0
-        K, c2w = np.asarray(pool.K[scene][views], np.float64), np.asarray(pool.c2w[scene][views], np.float64)
+        rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
+        c2w = np.asarray(sequence["c2w"][views], np.float64)
         if cfg.augment:
             rgb, K, c2w = alter(rng, rgb, K, c2w)
         samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))

@@ -1,0 +1,155 @@
+"""Two kinds of files: training checkpoints (Orbax, exact, resumable) and models (safetensors + config.json, to share).
+
+A model is a folder: `config.json` (the whole configuration and where the weights come from), one or more
+`model-0000i-of-0000n.safetensors` of at most 15 MB, all written under a temporary name and renamed.
+"""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from . import model
+from .config import PRESETS, RoGeConfig, from_dict, to_dict
+from .core.params import Tree, check, flatten, unflatten
+from .errors import UserError, did_you_mean
+
+SHARD_BYTES = 15_000_000
+ASSETS = Path(__file__).with_name("assets")
+WEIGHTS_VARIABLE = "ROGE_WEIGHTS"  # a folder with further models, looked up by name
+
+
+class Checkpoints:
+    """The last `keep` training states in a folder. A state that was cut off while being written is never seen."""
+
+    def __init__(self, folder: Path, keep: int = 3):
+        import orbax.checkpoint as ocp
+
+        self.folder = Path(folder).resolve()
+        options = ocp.CheckpointManagerOptions(
+            max_to_keep=keep, enable_async_checkpointing=False, cleanup_tmp_directories=True
+        )
+        self._manager = ocp.CheckpointManager(self.folder, options=options)
+        self._ocp = ocp
+
+    def latest(self) -> int | None:
+        return self._manager.latest_step()
+
+    def save(self, step: int, state: Tree) -> None:
+        self._manager.save(step, args=self._ocp.args.StandardSave(state))
+        self._manager.wait_until_finished()
+
+    def restore(self, like: Tree, step: int | None = None) -> Tree:
+        """The state of `step` (default: the latest) with the structure, dtypes and shardings of `like`."""
+        step = self.latest() if step is None else step
+        abstract = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(x, "sharding", None)), like
+        )
+        try:
+            return self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
+        except ValueError as error:
+            first = str(error).splitlines()[0]
+            raise UserError(
+                f"The checkpoint of step {step} in {self.folder} was written by another model or stage "
+                f"({first}). Resume with the same preset and stage, or start in an empty folder."
+            ) from error
+
+    def close(self) -> None:
+        self._manager.close()
+
+
+def save_model(
+    folder: Path, params: Tree, config: RoGeConfig, *, dtype=jnp.bfloat16, provenance: dict | None = None
+) -> None:
+    """Write a model folder. Floating leaves are stored in `dtype`; an existing model there is replaced whole."""
+    from safetensors.flax import save_file
+
+    folder = Path(folder)
+    temporary = folder.with_name(folder.name + ".part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    shards: list[dict] = [{}]
+    size = 0
+    for path, leaf in flatten(params).items():
+        leaf = jnp.asarray(leaf)
+        leaf = leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
+        if size and size + leaf.nbytes > SHARD_BYTES:
+            shards.append({})
+            size = 0
+        shards[-1][path] = leaf
+        size += leaf.nbytes
+    for i, shard in enumerate(shards, 1):
+        save_file(shard, temporary / f"model-{i:05d}-of-{len(shards):05d}.safetensors")
+    record = {"format": 1, "config": to_dict(config), "provenance": provenance or {}}
+    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
+    old = folder.with_name(folder.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    temporary.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def find_model(name: str | Path) -> Path:
+    """The folder of a model: a path, or the name of a shipped one."""
+    folder = Path(name)
+    if (folder / "config.json").exists():
+        return folder
+    places = [ASSETS] + ([Path(os.environ[WEIGHTS_VARIABLE])] if WEIGHTS_VARIABLE in os.environ else [])
+    for place in places:
+        if (place / str(name) / "config.json").exists():
+            return place / str(name)
+    known = [p.parent.name for place in places for p in place.glob("*/config.json")]
+    if folder.exists():
+        raise UserError(f"{folder} has no config.json: give a folder written by roge_jax.convert or train.")
+    if str(name) in PRESETS:
+        raise UserError(
+            f"No trained weights of preset '{name}' are here: convert the official ones with "
+            f"`python -m roge_jax.convert`, or set {WEIGHTS_VARIABLE} to a folder that has '{name}/config.json'."
+        )
+    raise UserError(f"Unknown checkpoint '{name}': {did_you_mean(str(name), known)}")
+
+
+def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig]:
+    """(params, config) of a model folder or shipped model, floating leaves in `dtype`, checked against the config."""
+    from safetensors import SafetensorError
+    from safetensors.flax import load_file
+
+    folder = find_model(name)
+    config = load_config(folder)
+    files = sorted(folder.glob("model-*.safetensors"))
+    expected = int(files[0].stem.rsplit("-", 1)[1]) if files else 1
+    if len(files) != expected:
+        have = {f.name for f in files}
+        lost = [f"model-{i:05d}-of-{expected:05d}.safetensors" for i in range(1, expected + 1)]
+        lost = [f for f in lost if f not in have] or ["model-*.safetensors"]
+        raise UserError(f"{folder} is incomplete: {', '.join(lost)} missing. Copy the whole folder again.")
+    flat: dict[str, jax.Array] = {}
+    for file in files:
+        try:
+            flat |= load_file(file)
+        except SafetensorError as error:
+            raise UserError(f"{file} is truncated or not a safetensors file ({error}): copy it again.") from error
+    params = unflatten(
+        {k: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v for k, v in flat.items()}
+    )
+    check(params, model.specs(config), source=str(folder))
+    return params, config
+
+
+def load_config(folder: Path) -> RoGeConfig:
+    file = Path(folder) / "config.json"
+    try:
+        record = json.loads(file.read_text())
+        values = record["config"]
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UserError(f"{file} is not a roge_jax model config ({error}): copy the folder again.") from error
+    return from_dict(values, source=str(file))
+
+
+def tree_bytes(tree: Tree) -> int:
+    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in flatten(tree).values())

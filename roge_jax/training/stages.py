@@ -1,0 +1,163 @@
+"""The stages of training: what each one trains, on which samples, with which loss.
+
+A stage's objective is `objective(trainable, frozen, batch, key, config=..., stage=...) -> (loss, terms)`, differentiated
+in its first argument. `vae`, `recon` and `prior` make the networks that RoGe takes as pretrained; `joint` is the
+paper's end-to-end step; `hires` is its second stage, at higher resolution with the reconstruction frozen.
+"""
+
+import dataclasses
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import model
+from ..config import RoGeConfig
+from ..core.lora import attach
+from ..core.params import Tree
+from ..data.views import ViewConfig, draw_batch
+from ..errors import UserError, did_you_mean
+from ..video import vae
+from .optim import OptimConfig
+
+
+@dataclass(frozen=True)
+class Stage:
+    name: str
+    objective: str  # vae | recon | prior | joint
+    trains: str  # regular expression for parameter paths
+    steps: int
+    batch: int
+    optim: OptimConfig
+    views: ViewConfig = field(default_factory=ViewConfig)
+    draws: int = 1  # noise levels per scene and step
+    lora: bool = False  # add LoRA factors to what trains
+    recon_shrink: int = 1  # divides the size at which the reconstruction works
+
+
+def vae_objective(trainable, frozen, batch, key, *, config, stage):
+    """Reconstruction and KL of clips [b, t, h, w, 3] in [0, 1]."""
+    p = attach(frozen, trainable)["vae"]
+    keys = jax.random.split(key, batch["target_rgb"].shape[0])
+    losses, terms = jax.vmap(
+        lambda clip, key: vae.vae_loss(p, 2.0 * clip - 1.0, key, cfg=config.vae)
+    )(batch["target_rgb"], keys)
+    return losses.mean(), {name: value.mean() for name, value in terms.items()}
+
+
+def recon_objective(trainable, frozen, batch, key, *, config, stage):
+    """Photometric loss of the RGB head on the targets."""
+    params = attach(frozen, trainable)
+
+    def scene(views):
+        m = views["context_rgb"].shape[0]
+        tokens = model.reconstruct(params, views, config=config)
+        targets = views | {"K": views["K"][m:], "c2w": views["c2w"][m:]}
+        features = model.query_rays(params, tokens, targets, config=config, context=views)
+        truth = model.resized(views["target_rgb"], config.recon_height, config.recon_width)
+        return jnp.square(model.decode_rgb(params, features, config=config) - truth).mean()
+
+    mse = jax.vmap(scene)(batch).mean()
+    return mse, {"psnr": -10 * jnp.log10(mse)}
+
+
+def prior_objective(trainable, frozen, batch, key, *, config, stage):
+    """Flow matching without rays or geometry: photos to video, the generator that RoGe starts from."""
+    params = attach(frozen, trainable)
+
+    def scene(views, key):
+        m = views["context_rgb"].shape[0]
+        latents = [
+            model.encode_contexts(params, views["context_rgb"], config=config),
+            model.encode_targets(params, views["target_rgb"], config=config),
+        ]
+        x0 = jax.lax.stop_gradient(jnp.concatenate(latents))
+        cond = model.unconditioned(x0[:m], x0.shape[0], config=config)
+        return jax.lax.map(
+            lambda key: model.flow_matching(params, x0, cond, key, config=config, contexts=m),
+            jax.random.split(key, stage.draws),
+        ).mean()
+
+    loss = jax.vmap(scene)(batch, jax.random.split(key, batch["K"].shape[0])).mean()
+    return loss, {"flow": loss}
+
+
+def joint_objective(trainable, frozen, batch, key, *, config, stage):
+    return model.loss(trainable, frozen, batch, key, config=config, draws=stage.draws)
+
+
+OBJECTIVES = {
+    "vae": vae_objective,
+    "recon": recon_objective,
+    "prior": prior_objective,
+    "joint": joint_objective,
+}
+
+_SCRATCH = OptimConfig(
+    name="muon", learning_rate=2e-3, warmup=60, decay=0.5, weight_decay=0.0, ema=0.998
+)
+
+
+def mini_stages(scale: float = 1.0) -> list[Stage]:
+    """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
+    video = ViewConfig(targets=17, ordered=True)
+    images, short = ViewConfig(targets=1), ViewConfig(targets=5, ordered=True)
+    views = ViewConfig(targets=8, near=0.5)
+    stages = [
+        Stage("vae_images", "vae", "^vae/", 1500, 24, _SCRATCH, images),
+        Stage("vae_clips", "vae", "^vae/", 1500, 4, _SCRATCH, short),
+        Stage("recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2),
+        Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
+        Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
+        Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=6),
+        Stage("joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4),
+    ]
+    return [dataclasses.replace(s, steps=max(1, round(s.steps * scale))) for s in stages]
+
+
+def lora_stage(steps: int, batch: int = 1) -> Stage:
+    """The paper's recipe (Sec. 3.3): LoRA on both halves, E1 and the new embeddings fully, AdamW."""
+    return Stage(
+        "lora",
+        "joint",
+        model.NEW_EMBEDDINGS,
+        steps,
+        batch,
+        OptimConfig(),
+        ViewConfig(targets=17, ordered=True),
+        lora=True,
+    )
+
+
+def find_stage(stages: list[Stage], name: str) -> Stage:
+    for stage in stages:
+        if stage.name == name:
+            return stage
+    raise UserError(f"Unknown stage '{name}': {did_you_mean(name, [s.name for s in stages])}")
+
+
+def stage_config(config: RoGeConfig, stage: Stage) -> RoGeConfig:
+    """The model's configuration at the stage's resolution and clip length."""
+    size = stage.views.size or (config.height, config.width)
+    shrink = stage.recon_shrink
+    frames = stage.views.targets if stage.objective in ("joint", "prior") else config.frames
+    return dataclasses.replace(
+        config,
+        height=size[0],
+        width=size[1],
+        recon_height=size[0] * config.recon_height // (shrink * config.height),
+        recon_width=size[1] * config.recon_width // (shrink * config.width),
+        frames=frames,
+    )
+
+
+def stage_batch(pool, stage: Stage, config: RoGeConfig, seed: int, index: int) -> dict[str, np.ndarray]:
+    """Batch number `index` of a stage; a pure function of its arguments."""
+    batch = draw_batch(pool, seed, index, stage.batch, stage.views, scale_rule=config.scale_rule)
+    return {"target_rgb": batch["target_rgb"]} if stage.objective == "vae" else batch
+
+
+def new_leaves(config: RoGeConfig, stage: Stage) -> Tree:
+    """Specs of leaves that the stage adds to the model: LoRA factors, or nothing."""
+    return model.adapter_specs(config) if stage.lora else {}
