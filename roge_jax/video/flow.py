@@ -10,7 +10,7 @@ made on the host, so that they are checked before anything is compiled.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -115,7 +115,7 @@ def training_sigma(
     """
     _known(method, SIGMA_SAMPLERS, "sigma sampler")
     if method == "uniform_index":
-        u = 1.0 - jax.random.randint(key, shape, 0, TRAIN_POINTS) / TRAIN_POINTS
+        u = jax.random.randint(key, shape, 1, TRAIN_POINTS + 1) / TRAIN_POINTS
     else:
         u = jax.nn.sigmoid(mean + std * jax.random.normal(key, shape))
     return shifted(u.astype(jnp.float32), shift)
@@ -283,6 +283,31 @@ def optimise_schedule(sigmas: np.ndarray, errors: np.ndarray, steps: int) -> np.
     for row in reversed(previous):
         path.append(int(row[path[-1]]))
     return sigmas[path[::-1]]
+
+
+def refine_schedule(
+    error: Callable[[np.ndarray], float], grid: np.ndarray, *, rounds: int = 3, trials: int = 5
+) -> np.ndarray:
+    """Move the inner points of `grid` one by one to where `error(grid)` is least.
+
+    `error` runs the sampler itself and returns its end error to a teacher, so this sees what the
+    sum of jump errors cannot: how the rest of the path shrinks or grows an early error, and the
+    memory of multistep solvers. `trials` places per point and round, between its neighbours, the
+    search narrowing each round. The result is never worse than `grid` under `error`.
+    """
+    grid, best = np.array(grid, np.float64), float(error(grid))
+    for k in range(rounds):
+        reach = 0.8 * 0.5**k
+        for i in range(1, len(grid) - 1):
+            here = grid[i]
+            up, down = grid[i - 1] - here, grid[i + 1] - here
+            for t in np.linspace(-reach, reach, trials):
+                trial = grid.copy()
+                trial[i] = here + (t * up if t > 0 else -t * down)
+                value = float(error(trial)) if t else best
+                if value < best:
+                    grid, best = trial, value
+    return grid
 
 
 def _known(word: str, options: Sequence[str], what: str) -> None:

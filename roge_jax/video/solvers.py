@@ -121,14 +121,17 @@ def solve(
 
     def body(carry, row):
         stored, info = carry
-        stored, info, x = _evaluate(velocity, project, stored, info, row)
-        return (stored, info), (x if keep_states else None)
+        x, sigma, info = _look_up(stored, info, row, project)
 
-    rows = _rows(table)
-    (stored, info), seen = jax.lax.scan(body, (stored, fresh_info(x1.size, dtype)), rows)
-    end = jnp.asarray(table.grid, jnp.promote_types(dtype, jnp.float32))[-1]
-    x0 = stored[0] if project is None else project(stored[0], end).astype(dtype)
-    info = note(info, x0, BAD_STATE, len(table.grid) - 1, end)
+        def call():  # after a failure nothing moves and the network is not called
+            return _take_in(stored, info, row, velocity(x, sigma), sigma)
+
+        carry = jax.lax.cond(info.failed, lambda: (stored, info), call)
+        return carry, (x if keep_states else None)
+
+    start = (stored, fresh_info(x1.size, dtype))
+    (stored, info), seen = jax.lax.scan(body, start, _rows(table))
+    x0, info = _finish(table, stored, info, project)
     if keep_states:
         info = info.replace(states=jnp.concatenate([seen[table.first], x0[None]]))
     return x0, info
@@ -150,26 +153,19 @@ def iterate(
     """
     table = _table(solver, sigmas, breaks)
     dtype = jnp.promote_types(x1.dtype, jnp.float32)
-    stored = _start(table, x1.astype(dtype))
-    info, rows = fresh_info(x1.size, dtype), _rows(table)
+    stored, info = _start(table, x1.astype(dtype)), fresh_info(x1.size, dtype)
     count = len(table.sigma)
     for e in range(count):
-        row = jax.tree.map(lambda leaf, e=e: leaf[e], rows)
-        x, sigma = _look(stored[0], project, row)
-        info = note(info, x, BAD_STATE, row["step"], sigma)
+        row = {name: np.asarray(leaf)[e] for name, leaf in _rows(table).items()}
+        x, sigma, info = _before(stored, info, row, project)
         raise_if_failed(info)
-        v = velocity(x, sigma)
-        info = note(
-            info.replace(evaluations=info.evaluations + 1), v, BAD_VELOCITY, row["step"], sigma
-        )
+        stored, info = _after(stored, info, row, velocity(x, sigma), sigma)
         raise_if_failed(info)
-        stored = _mix_jit(row["mix"], stored, v)
-        yield e + 1, count, stored[0]
-    end = jnp.asarray(table.grid[-1], stored.dtype)
-    x0 = stored[0] if project is None else project(stored[0], end)
-    raise_if_failed(note(info, x0, BAD_STATE, len(table.grid) - 1, end))
-    if project is not None:
-        yield count, count, x0
+        if e + 1 < count:
+            yield e + 1, count, stored[0]
+    x0, info = _finish(table, stored, info, project)
+    raise_if_failed(info)
+    yield count, count, x0
 
 
 # ---- one evaluation ------------------------------------------------------------------------------
@@ -191,8 +187,7 @@ def _start(table: Table, x1: Array) -> Array:
 
 
 def _rows(table: Table) -> dict[str, Array]:
-    names = ("sigma", "side", "step", "mix")
-    return {name: jnp.asarray(getattr(table, name)) for name in names}
+    return {"sigma": table.sigma, "side": table.side, "step": table.step, "mix": table.mix}
 
 
 def _look(x: Array, project: Project | None, row: dict[str, Array]) -> tuple[Array, Array]:
@@ -217,26 +212,24 @@ def _mix(mix: Array, stored: Array, v: Array) -> Array:
     return jnp.stack(rows).astype(stored.dtype)
 
 
-_mix_jit = jax.jit(_mix)
-
-
-def _evaluate(
-    velocity: Velocity,
-    project: Project | None,
-    stored: Array,
-    info: SolveInfo,
-    row: dict[str, Array],
-) -> tuple[Array, SolveInfo, Array]:
-    """One row of the table. After a failure nothing moves and the network is not called."""
+def _look_up(stored: Array, info: SolveInfo, row, project: Project | None):
+    """State and noise level of a row's evaluation, checked."""
     x, sigma = _look(stored[0], project, row)
-    info = note(info, x, BAD_STATE, row["step"], sigma)
+    return x, sigma, note(info, x, BAD_STATE, row["step"], sigma)
 
-    def call() -> tuple[Array, SolveInfo]:
-        v = velocity(x, sigma)
-        after = info.replace(evaluations=info.evaluations + 1)
-        after = note(after, v, BAD_VELOCITY, row["step"], sigma)
-        mixed = _mix(row["mix"], stored, v)
-        return jnp.where(after.failed, stored, mixed), after
 
-    stored, info = jax.lax.cond(info.failed, lambda: (stored, info), call)
-    return stored, info, x
+def _take_in(stored: Array, info: SolveInfo, row, v: Array, sigma: Array):
+    """Check the velocity of a row and mix it in; a failed run stays where it is."""
+    info = info.replace(evaluations=info.evaluations + 1)
+    info = note(info, v, BAD_VELOCITY, row["step"], sigma)
+    return jnp.where(info.failed, stored, _mix(row["mix"], stored, v)), info
+
+
+def _finish(table: Table, stored: Array, info: SolveInfo, project: Project | None):
+    end = jnp.asarray(table.grid, jnp.promote_types(stored.dtype, jnp.float32))[-1]
+    x0 = stored[0] if project is None else project(stored[0], end).astype(stored.dtype)
+    return x0, note(info, x0, BAD_STATE, len(table.grid) - 1, end)
+
+
+_before = jax.jit(_look_up, static_argnames="project")
+_after = jax.jit(_take_in)

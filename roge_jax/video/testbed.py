@@ -1,6 +1,7 @@
 """Flows whose answer is known: the problems every sampler is tested and charted on.
 
-A problem is a velocity field with, where one exists, the exact map from x at sigma = 1 to x at 0.
+A problem is a velocity field with, where one exists, the exact map from one noise level to another
+(by default from sigma = 1 to 0).
 
   gaussian      N(0, I) -> N(mean, std^2): x(0) = mean + std x(1). A small std is a near-delta: a
                 boundary layer of width ~std at sigma = 0 whose Jacobian peaks at 1 / (2 std)
@@ -28,12 +29,12 @@ from roge_jax.video.solvers import guided
 
 @dataclass(frozen=True)
 class Problem:
-    """`velocity(x, sigma)` on states [..., dim]; `exact(x1)` is the flow's end, if it is known."""
+    """`velocity(x, sigma)` on states [..., dim]; `exact(x, start=1, end=0)` the flow, if known."""
 
     name: str
     dim: int
     velocity: Callable[[Array, Array], Array]
-    exact: Callable[[Array], Array] | None = None
+    exact: Callable[..., Array] | None = None
     breaks: tuple[float, ...] = ()
 
 
@@ -52,7 +53,12 @@ def gaussian(mean, std, name: str = "gaussian") -> Problem:
         variance = (1 - sigma) ** 2 * s2 + sigma**2
         return -m + (sigma - (1 - sigma) * s2) / variance * (x - (1 - sigma) * m)
 
-    return Problem(name, len(mean), velocity, lambda x: _along(x, mean) + _along(x, std) * x)
+    def exact(x: Array, start: float = 1.0, end: float = 0.0) -> Array:
+        m, s2 = _along(x, mean), _along(x, std**2)
+        growth = ((1 - end) ** 2 * s2 + end**2) / ((1 - start) ** 2 * s2 + start**2)
+        return (1 - end) * m + jnp.sqrt(growth) * (x - (1 - start) * m)
+
+    return Problem(name, len(mean), velocity, exact)
 
 
 def delta(mean) -> Problem:
@@ -63,7 +69,11 @@ def delta(mean) -> Problem:
         m = _along(x, mean)
         return -m + (x - (1 - sigma) * m) / sigma
 
-    return Problem("delta", len(mean), velocity, lambda x: jnp.zeros_like(x) + _along(x, mean))
+    def exact(x: Array, start: float = 1.0, end: float = 0.0) -> Array:
+        m = _along(x, mean)
+        return (1 - end) * m + (end / start) * (x - (1 - start) * m)
+
+    return Problem("delta", len(mean), velocity, exact)
 
 
 def low_rank(dim: int, rank: int, std: float, seed: int = 0) -> Problem:
@@ -94,19 +104,23 @@ def mixture(weights, means, stds, name: str = "mixture") -> Problem:
 
 
 def _quantile_map(weights: np.ndarray, means: np.ndarray, stds: np.ndarray):
-    """In one dimension trajectories cannot cross, so x(0) has the quantile that x(1) has."""
+    """In one dimension paths cannot cross: x keeps its quantile from one noise level to another."""
 
-    def exact(x1: Array) -> Array:
+    def below(x: np.ndarray, sigma: float) -> np.ndarray:
         from scipy.special import ndtr
 
-        x1 = np.asarray(x1, np.float64)[..., 0]
-        level = ndtr(x1)
-        low = np.full(x1.shape, (means - 12 * stds).min())
-        high = np.full(x1.shape, (means + 12 * stds).max())
+        spread = np.sqrt((1 - sigma) ** 2 * stds**2 + sigma**2)
+        return (ndtr((x[..., None] - (1 - sigma) * means) / spread) * weights).sum(-1)
+
+    def exact(x: Array, start: float = 1.0, end: float = 0.0) -> Array:
+        x = np.asarray(x, np.float64)[..., 0]
+        level = below(x, start)
+        low = np.full(x.shape, means.min() - 12 * max(stds.max(), 1.0))
+        high = np.full(x.shape, means.max() + 12 * max(stds.max(), 1.0))
         for _ in range(200):
             mid = 0.5 * (low + high)
-            below = (ndtr((mid[..., None] - means) / stds) * weights).sum(-1) < level
-            low, high = np.where(below, mid, low), np.where(below, high, mid)
+            left = below(mid, end) < level
+            low, high = np.where(left, mid, low), np.where(left, high, mid)
         return jnp.asarray(0.5 * (low + high))[..., None]
 
     return exact
@@ -170,7 +184,11 @@ def initial_value(name: str, f, start, duration: float, exact=None) -> tuple[Pro
 def dahlquist(rate: float) -> tuple[Problem, np.ndarray]:
     """y' = rate y, y(0) = 1: the stability function of a method at rate / steps."""
     return initial_value(
-        "dahlquist", lambda t, y: rate * y, [1.0], 1.0, lambda y: y * float(np.exp(rate))
+        "dahlquist",
+        lambda t, y: rate * y,
+        [1.0],
+        1.0,
+        lambda y, start=1.0, end=0.0: y * float(np.exp(rate * (start - end))),
     )
 
 
@@ -181,7 +199,7 @@ def prothero_robinson(rate: float) -> tuple[Problem, np.ndarray]:
         lambda t, y: rate * (y - jnp.cos(t)) - jnp.sin(t),
         [1.0],
         1.0,
-        lambda y: jnp.full_like(y, float(np.cos(1.0))),
+        lambda y, start=1.0, end=0.0: jnp.full_like(y, float(np.cos(1.0 - end))),
     )
 
 

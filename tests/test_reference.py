@@ -1,0 +1,149 @@
+"""The implicit reference: tableaux, orders, stiff problems, and when it refuses to answer."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from roge_jax.errors import UserError
+from roge_jax.video import flow, testbed
+from roge_jax.video.reference import (
+    ReferenceRejected,
+    integrate,
+    nodes,
+    reference_solution,
+    tableau,
+)
+
+
+@pytest.mark.parametrize("family", ["gauss", "radau"])
+@pytest.mark.parametrize("stages", [1, 2, 3, 5, 9])
+def test_tableaux_meet_the_order_conditions(family, stages):
+    a, b, c = tableau(family, stages)
+    assert b.sum() == pytest.approx(1, abs=1e-14)
+    order = 2 * stages - (family == "radau")
+    for k in range(1, order + 1):  # B(p): quadrature
+        assert b @ c ** (k - 1) == pytest.approx(1 / k, abs=1e-13)
+    assert abs(b @ c**order - 1 / (order + 1)) > 1e-13 or order > 12  # and no further
+    for k in range(1, stages + 1):  # C(s): stages
+        np.testing.assert_allclose(a @ c ** (k - 1), c**k / k, rtol=0, atol=1e-13)
+    # growth at z -> -infinity: 1 for Gauss (A-stable only), 0 for Radau IIA (L-stable)
+    growth = 1 - b @ np.linalg.solve(a, np.ones(stages))
+    assert abs(growth) == pytest.approx(1 if family == "gauss" else 0, abs=1e-11)
+    assert nodes(family, stages)[-1] == 1 if family == "radau" else nodes(family, stages)[-1] < 1
+
+
+def test_known_tableaux():
+    a, _, c = tableau("radau", 2)
+    np.testing.assert_allclose(a, [[5 / 12, -1 / 12], [3 / 4, 1 / 4]], atol=1e-15)
+    np.testing.assert_allclose(c, [1 / 3, 1], atol=1e-15)
+    np.testing.assert_allclose(tableau("gauss", 1)[0], [[0.5]], atol=1e-15)
+    with pytest.raises(UserError, match="did you mean 'radau'"):
+        tableau("radua", 2)
+
+
+@pytest.mark.parametrize(
+    "rate, family, stages, order",
+    [
+        (-1.0, "gauss", 2, 4),
+        (-1.0, "gauss", 3, 6),
+        (-1.0, "radau", 3, 5),
+        # order reduction in the stiff limit: the stage order s, and Radau divides by the rate
+        (-1e6, "gauss", 3, 4),
+        (-1e6, "radau", 2, 2),
+    ],
+)
+def test_orders_on_prothero_robinson_and_their_reduction(rate, family, stages, order):
+    with jax.enable_x64(True):
+        problem, start = testbed.prothero_robinson(rate)
+        errors = []
+        for n in (4, 8, 16):
+            grid = np.linspace(1, 0, n + 1)
+            x, report = integrate(
+                problem.velocity, start, grid, family=family, stages=stages, end_inside=False
+            )
+            assert int(report["failed"]) == 0
+            errors.append(abs(float(x[0]) - np.cos(1)))
+        observed = np.log2(errors[:-1]) - np.log2(errors[1:])
+        assert observed[-1] == pytest.approx(order, abs=0.3)
+        if rate == -1e6 and family == "radau":
+            assert max(errors) < 1e-7  # damped by 1 / rate; Gauss has 1e-5 here
+
+
+@pytest.mark.parametrize("name", ["van_der_pol", "hires"])
+def test_stiff_problems_agree_with_scipy(name):
+    from scipy.integrate import solve_ivp
+
+    with jax.enable_x64(True):
+        make = {"van_der_pol": lambda: testbed.van_der_pol(10.0, 12.0), "hires": testbed.hires}
+        problem, start = make[name]()
+        # time runs 0 -> 1 = sigma 1 -> 0; HIRES needs short steps first, geometric growth after
+        time = np.linspace(0, 1, 401) if name == "van_der_pol" else np.expm1(np.linspace(0, 8, 401))
+        grid = 1 - time / time[-1]
+        x, report = integrate(problem.velocity, start, grid, stages=5, end_inside=False)
+        assert int(report["failed"]) == 0
+        jitted = jax.jit(problem.velocity)
+        oracle = solve_ivp(
+            lambda t, y: -np.asarray(jitted(y, 1 - t)),
+            (0, 1),
+            start,
+            method="LSODA",
+            rtol=1e-10,
+            atol=1e-13,
+        ).y[:, -1]
+        assert np.linalg.norm(x - oracle) < 1e-5 * np.linalg.norm(oracle)
+
+
+def test_failed_steps_are_reported_not_hidden():
+    def field(x, sigma):  # a root that Newton cannot reach: the field ends at sigma = 0.5
+        return jnp.where(sigma > 0.5, x, jnp.nan)
+
+    _, report = integrate(field, jnp.ones(3), np.linspace(1, 0, 9))
+    # the step 0.625 -> 0.5 looks at its end from inside and is fine; the next one cannot be
+    assert int(report["first"]) == 4 and int(report["failed"]) == 4
+
+
+@pytest.mark.parametrize("stepper", ["newton", "newton_krylov", "picard"])
+def test_reference_meets_the_exact_flow(stepper):
+    with jax.enable_x64(True):
+        problem = testbed.gaussian([0.3, -1.0, 2.0, 0.1], [0.02, 0.3, 1.0, 1.5])
+        x1 = np.random.default_rng(0).normal(size=(2, 4))
+        found = reference_solution(problem.velocity, x1, stepper=stepper, tolerance=1e-8)
+        assert found.self_error <= 1e-8
+        exact = problem.exact(jnp.asarray(x1))
+        assert float(jnp.linalg.norm(found.x0 - exact) / jnp.linalg.norm(exact)) <= found.self_error
+
+
+def test_reference_refuses_a_jump_unless_it_is_named():
+    with jax.enable_x64(True):
+        problem = testbed.guided_mixture(4.0, (0.313, 0.787), dim=2)
+        x1 = np.random.default_rng(0).normal(size=(2, 2))
+        arguments = {"tolerance": 1e-7, "stages": 3, "stepper": "picard", "doublings": 3}
+        found = reference_solution(problem.velocity, x1, breaks=problem.breaks, **arguments)
+        assert found.self_error <= 1e-7
+        with pytest.raises(ReferenceRejected, match=r"candidates differ .* name the noise levels"):
+            reference_solution(problem.velocity, x1, **arguments)
+
+
+def test_reference_refuses_unconverged_steps():
+    with jax.enable_x64(True):
+        problem, start = testbed.dahlquist(-1e6)  # Picard contracts only for |h rate| below ~1
+        with pytest.raises(ReferenceRejected, match="did not converge, the first from sigma 1"):
+            reference_solution(problem.velocity, start, stepper="picard", doublings=0)
+
+
+def test_reference_never_looks_at_zero():
+    with jax.enable_x64(True):
+        problem = testbed.delta([0.5, -2.0])  # 0/0 at sigma = 0
+        found = reference_solution(problem.velocity, np.ones((1, 2)), doublings=1)
+        np.testing.assert_allclose(found.x0, [[0.5, -2.0]], atol=1e-12)
+
+
+def test_grid_of_the_caller_is_refined_not_replaced():
+    with jax.enable_x64(True):
+        problem = testbed.gaussian([0.3], [0.5])
+        grid = flow.schedule("graded", 6, sigma_min=0.05)[:-1]  # stops at sigma = 0.05
+        found = reference_solution(problem.velocity, np.ones((1, 1)), sigmas=grid, steps=12)
+        s = 0.05
+        exact = (1 - s) * 0.3 + np.sqrt((1 - s) ** 2 * 0.25 + s**2)
+        assert float(found.x0[0, 0]) == pytest.approx(exact, rel=1e-9)
