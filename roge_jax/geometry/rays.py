@@ -1,7 +1,9 @@
 """Rays: pixels to Pluecker coordinates and back; float32 JAX on re-centred cameras."""
 
+import functools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,7 +18,7 @@ def plucker(K: Any, c2w: Any, height: int, width: int) -> jnp.ndarray:
     The ray passes through the pixel centre (column + 0.5, row + 0.5); d has length 1, o is the
     camera centre.
     """
-    return _plucker(jnp.asarray(K, jnp.float32), jnp.asarray(c2w, jnp.float32), height, width, jnp)
+    return _plucker_jax(jnp.asarray(K, jnp.float32), jnp.asarray(c2w, jnp.float32), height, width)
 
 
 def plucker_float64(K: np.ndarray, c2w: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -51,6 +53,11 @@ def _plucker(K: Any, c2w: Any, height: int, width: int, use: Any) -> Any:
     d = R[..., 0] * local[..., 0:1] + R[..., 1] * local[..., 1:2] + R[..., 2] * local[..., 2:3]
     o = use.broadcast_to(c2w[..., None, None, :3, 3], d.shape)
     return use.concatenate([d, use.cross(o, d)], -1)
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _plucker_jax(K: jnp.ndarray, c2w: jnp.ndarray, height: int, width: int) -> jnp.ndarray:
+    return _plucker(K, c2w, height, width, jnp)
 
 
 def project(K: Any, c2w: Any, points: Any, near: float = 1e-6) -> tuple[Any, Any, Any]:
