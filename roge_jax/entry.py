@@ -1,0 +1,324 @@
+"""What every program shares: one sentence for a mistake, a compilation cache, run.json, whole output folders.
+
+    if __name__ == "__main__":
+        run(main, parser())         # main(args: argparse.Namespace) -> exit code or anything else for 0
+
+Exit codes: 0 fine, 1 the computation stopped (not finite, out of budget), 2 a mistake in the input, 130 interrupted.
+This module imports neither JAX nor NumPy, so that a program can still choose its devices.
+"""
+
+import argparse
+import contextlib
+import datetime
+import hashlib
+import importlib.metadata
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from .errors import UserError, did_you_mean
+
+CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
+RECORD = "run.json"
+PACKAGES = ("roge_jax", "jax", "jaxlib", "flax", "numpy", "av", "opencv-contrib-python-headless", "pillow")
+
+
+# ---- running a program ---------------------------------------------------------------------------
+
+
+def run(
+    main: Callable[[argparse.Namespace], Any],
+    parser: argparse.ArgumentParser,
+    arguments: Sequence[str] | None = None,
+) -> NoReturn:
+    """`execute`, then leave the process with its exit code."""
+    sys.exit(execute(main, parser, arguments))
+
+
+def execute(
+    main: Callable[[argparse.Namespace], Any],
+    parser: argparse.ArgumentParser,
+    arguments: Sequence[str] | None = None,
+) -> int:
+    """Parse `arguments` (default: the command line), call main, and turn its errors into the exit code.
+
+    Mistakes are one sentence on stderr; `--debug`, if the parser has it, shows the traceback as well. An integer
+    that `main` returns is the exit code. Warnings are printed as one line each.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in arguments
+    with warnings.catch_warnings():
+        warnings.showwarning = _one_line
+        try:
+            args = parse(parser, arguments)
+            enable_cache()
+            code = main(args)
+            return code if isinstance(code, int) else 0
+        except UserError as error:
+            return _report(error, 2, debug)
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return 130
+        except RuntimeError as error:
+            if not isinstance(error, _expected_stops()):
+                raise
+            return _report(error, 1, debug)
+
+
+def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """Parsed arguments. Raises UserError, with the closest option, where argparse would print its usage and exit."""
+
+    def error(message: str) -> NoReturn:
+        raise UserError(f"{message[:1].upper()}{message[1:]}; --help explains all options.")
+
+    parser.allow_abbrev = False
+    parser.error = error  # type: ignore[method-assign]
+    args, unknown = parser.parse_known_args(list(arguments))
+    if unknown:
+        options = [name for action in parser._actions for name in action.option_strings if name[:2] == "--"]
+        word = unknown[0].partition("=")[0]
+        if word.startswith("-"):
+            raise UserError(f"Unknown option '{word}': {did_you_mean(word, options)}")
+        raise UserError(f"'{word}' belongs to no option: {did_you_mean('--' + word, options)}")
+    return args
+
+
+def one_of(options: Iterable[str]) -> Callable[[str], str]:
+    """An argparse `type` that takes these words and names the closest one for any other."""
+    options = tuple(options)
+
+    def check(word: str) -> str:
+        if word not in options:
+            raise argparse.ArgumentTypeError(f"unknown value '{word}': {did_you_mean(word, options).rstrip('.')}")
+        return word
+
+    return check
+
+
+def number(low: float | None = None, *, whole: bool = True) -> Callable[[str], Any]:
+    """An argparse `type` for numbers of at least `low`."""
+
+    def check(text: str) -> float:
+        kind = "whole number" if whole else "number"
+        bound = "" if low is None else f" of at least {low:g}"
+        try:
+            value = int(text) if whole else float(text)
+        except ValueError:
+            value = None
+        if value is None or value != value or abs(value) == float("inf") or (low is not None and value < low):
+            raise argparse.ArgumentTypeError(f"'{text}' is not a {kind}{bound}")
+        return value
+
+    return check
+
+
+def _expected_stops() -> tuple[type[BaseException], ...]:
+    """Errors that mean the computation ended early, not that the program is wrong. Imported only once one is raised."""
+    found = []
+    for module, name in (("video.solve_info", "SamplingError"), ("training.loop", "TrainingStopped")):
+        loaded = sys.modules.get(f"{__package__}.{module}")
+        if loaded is not None:
+            found.append(getattr(loaded, name))
+    return tuple(found)
+
+
+def _report(error: BaseException, code: int, debug: bool) -> int:
+    if debug:
+        traceback.print_exception(error)
+    else:
+        print(f"error: {error}", file=sys.stderr)
+    return code
+
+
+def _one_line(message, category, filename, lineno, file=None, line=None) -> None:
+    if issubclass(category, UserWarning):
+        print(f"warning: {message}", file=sys.stderr)
+
+
+# ---- compiled programs are kept ------------------------------------------------------------------
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept: ROGE_CACHE, or the user's cache folder; None if ROGE_CACHE is "off".
+
+    One folder per kind of processor: a program compiled for one may not run on another that shares the disk.
+    """
+    given = os.environ.get(CACHE_VARIABLE, "")
+    if given.lower() in ("off", "0", "no"):
+        return None
+    base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roge_jax"
+    return base / f"programs-{_processor()}"
+
+
+def _processor() -> str:
+    text = platform.machine() + platform.processor()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        text += "".join(re.findall(r"^(?:model name|flags)\s*:.*$", cpuinfo.read_text(), re.M)[:2])
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
+
+
+def enable_cache() -> Path | None:
+    """Keep every compiled program on disk, so that the next run starts faster. JAX's own setting has precedence."""
+    folder = cache_folder()
+    if folder is None or "JAX_COMPILATION_CACHE_DIR" in os.environ:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError
+    except OSError:
+        warnings.warn(f"compiled programs are not kept: cannot write to {folder} (set {CACHE_VARIABLE})", stacklevel=2)
+        return None
+    settings = {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+    if "jax" in sys.modules:
+        for name, value in settings.items():
+            sys.modules["jax"].config.update(name, value)
+    else:
+        os.environ |= {name.upper(): str(value) for name, value in settings.items()}
+    return folder
+
+
+# ---- what a run was ------------------------------------------------------------------------------
+
+
+class Clock:
+    """Seconds and peak memory of the stages of a run.
+
+        with clock("load"): ...
+        clock.record()      {"load": {"seconds": 1.2, "peak_memory_gb": 0.8}, ..}
+
+    Memory is the process's peak so far (host) and that of the first accelerator; a stage entered twice adds up.
+    """
+
+    def __init__(self):
+        self.start = time.perf_counter()
+        self.stages: dict[str, dict[str, float]] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            stage = self.stages.setdefault(name, {"seconds": 0.0})
+            stage["seconds"] += time.perf_counter() - begin
+            stage |= peak_memory()
+
+    def record(self) -> dict[str, Any]:
+        total = {"seconds": time.perf_counter() - self.start} | peak_memory()
+        stages = {**self.stages, "total": total}
+        return {name: {k: round(v, 3) for k, v in stage.items()} for name, stage in stages.items()}
+
+
+def peak_memory() -> dict[str, float]:
+    """Peak memory in GB (1e9 bytes): of this process, and of the first device where JAX reports it."""
+    found = {}
+    with contextlib.suppress(ImportError):  # no such module on Windows
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024
+        found["peak_memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e9
+    if "jax" in sys.modules:
+        stats = sys.modules["jax"].local_devices()[0].memory_stats() or {}
+        if "peak_bytes_in_use" in stats:
+            found["device_peak_memory_gb"] = stats["peak_bytes_in_use"] / 1e9
+    return found
+
+
+def environment() -> dict[str, Any]:
+    """Versions, devices, git commit and command: the part of run.json that is the same for every program."""
+    versions = {"python": platform.python_version()}
+    for package in PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    found: dict[str, Any] = {
+        "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "versions": versions,
+        "platform": platform.platform(),
+        "commit": git_commit(),
+    }
+    if "jax" in sys.modules:
+        devices = sys.modules["jax"].devices()
+        found["device"] = {"backend": devices[0].platform, "kind": devices[0].device_kind, "count": len(devices)}
+    return found
+
+
+def git_commit(folder: Path | None = None) -> str | None:
+    """The commit of the package's own checkout ("-dirty" if tracked files differ), None for an installed package."""
+    folder = folder or Path(__file__).resolve().parent.parent
+    if not (folder / ".git").exists():
+        return None
+    try:
+        call = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        return subprocess.run(call, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+def write_json(file: Path, content: Any) -> None:
+    """JSON with one temporary name, so that the file is whole or absent. NaN and infinity become null."""
+    file = Path(file)
+    temporary = file.with_name(file.name + ".part")
+    temporary.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
+    temporary.replace(file)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    return None if isinstance(value, float) and (value != value or abs(value) == float("inf")) else value
+
+
+# ---- output folders ------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def output_folder(out: str | Path) -> Iterator[Path]:
+    """A new folder to write into, renamed to `out` when the block ends and removed when it fails.
+
+    A folder of an earlier run (it holds run.json) is replaced only then; any other folder that has files in it is
+    left alone. Raises: UserError if `out` cannot be used, before anything is computed.
+    """
+    out = Path(out)
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out} is a file: give a folder.")
+    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).exists():
+        raise UserError(f"--out {out} has files that are not of an earlier run (no {RECORD}): give another folder.")
+    part, old = (out.with_name(out.name + suffix) for suffix in (".part", ".old"))
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir(parents=True)
+    except OSError as error:
+        raise UserError(f"--out {out} cannot be written ({error.strerror}): give another folder.") from None
+    try:
+        yield part
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+    if out.exists():
+        out.rename(old)
+    part.rename(out)
+    shutil.rmtree(old, ignore_errors=True)
