@@ -1,0 +1,325 @@
+"""Pools: many rendered sequences on disk, and the command line of `procedural`.
+
+A pool is a folder of shards. Shard k is `shard_00000.rgb.npy` (uint8 `[scenes,f,h,w,3]`),
+`shard_00000.depth.npy` (float16, optional) and `shard_00000.npz` (`seeds [scenes]`, `K` and `c2w`
+float64 `[scenes,f,...]`). The .npz is renamed into place last, so a shard with one is complete.
+"""
+
+import argparse
+import concurrent.futures
+import contextlib
+import dataclasses
+import fcntl
+import json
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.errors import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Pool:
+    """The finished shards of a pool; `pool[i]` is one scene, its frames still on disk.
+
+    `seeds [n]`, `K [n,f,3,3]`, `c2w [n,f,4,4]` (OpenCV, float64) are in memory; `rgb` and `depth`
+    are one memory map per shard.
+    """
+
+    rgb: list[np.ndarray]
+    depth: list[np.ndarray]
+    seeds: np.ndarray
+    K: np.ndarray
+    c2w: np.ndarray
+    starts: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.seeds)
+
+    def __getitem__(self, index: int) -> dict[str, np.ndarray]:
+        """`rgb [f,h,w,3]` uint8, `depth [f,h,w]` float16 if written, `K`, `c2w`, `seed`."""
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        shard = int(np.searchsorted(self.starts, index, side="right")) - 1
+        row = index - int(self.starts[shard])
+        scene = {"rgb": self.rgb[shard][row], "K": self.K[index], "c2w": self.c2w[index]}
+        scene["seed"] = self.seeds[index]
+        return scene | {"depth": self.depth[shard][row]} if self.depth else scene
+
+
+def write_pool(
+    path: str | Path,
+    seeds: Sequence[int],
+    frames: int,
+    height: int,
+    width: int,
+    processes: int = 1,
+    *,
+    supersample: int = 2,
+    scenes_per_shard: int = 100,
+    depth: bool = False,
+) -> None:
+    """Render `sample_sequence` of every seed into a pool with one-thread worker processes.
+
+    Finished shards are kept, so an interrupted call is resumed by repeating it.
+
+    Raises:
+        UserError: no seeds, seeds of both splits, a folder that holds a pool with other settings
+            or that another process is writing.
+    """
+    from roge_jax.data.procedural import HELDOUT_SEED, split_of
+
+    path = Path(path)
+    wanted = np.asarray(seeds, np.int64)
+    if not len(wanted):
+        raise UserError(f"{path}: no seeds were given; a pool needs at least one scene.")
+    if len({split_of(seed) for seed in wanted}) > 1:
+        raise UserError(
+            f"{path}: seeds {wanted.min()} .. {wanted.max()} mix training and held-out scenes; "
+            f"write seeds from {HELDOUT_SEED} on into a pool of their own."
+        )
+    settings = {"frames": frames, "height": height, "width": width, "supersample": supersample}
+    settings |= {"scenes_per_shard": scenes_per_shard, "depth": depth}
+    settings |= {"first_seed": int(wanted[0])}
+    path.mkdir(parents=True, exist_ok=True)
+    with _sole_writer(path):
+        _write_missing(path, wanted, settings, processes)
+
+
+@contextlib.contextmanager
+def _sole_writer(path: Path) -> Iterator[None]:
+    """Hold the folder's lock: two writers would truncate each other's unfinished shards.
+
+    The system drops the lock when its process ends, however it ends.
+    """
+    with (path / ".lock").open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise UserError(
+                f"{path} is being written by another process; wait for it or write elsewhere."
+            ) from None
+        yield
+
+
+def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int) -> None:
+    record = path / "pool.json"
+    if record.exists() and (old := json.loads(record.read_text())) != settings:
+        wrong = ", ".join(
+            f"{k} {old.get(k)} (asked: {v})" for k, v in settings.items() if old.get(k) != v
+        )
+        raise UserError(f"{record} holds a pool with {wrong}; write into another folder.")
+    record.write_text(json.dumps(settings, indent=1) + "\n")
+    jobs = _missing(path, seeds, settings)
+    # Threads lose on this work; one-thread processes scale. Workers read these when JAX starts.
+    old = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
+    os.environ.update(_WORKER_ENVIRONMENT)
+    try:
+        # An executor and not a multiprocessing.Pool: a worker that dies raises, it never hangs.
+        with concurrent.futures.ProcessPoolExecutor(
+            max(1, min(processes, len(jobs))), mp_context=multiprocessing.get_context("spawn")
+        ) as workers:
+            for done in concurrent.futures.as_completed(
+                workers.submit(_write_shard, j) for j in jobs
+            ):
+                name, seconds = done.result()
+                print(f"{name}: {seconds:.0f} s", flush=True)
+    finally:
+        for name, value in old.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+
+
+_WORKER_ENVIRONMENT = {
+    "JAX_PLATFORMS": "cpu",
+    "NPROC": "1",  # size of XLA's thread pool
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false",
+    "OPENBLAS_NUM_THREADS": "1",
+}
+
+
+def _missing(path: Path, seeds: np.ndarray, settings: dict) -> list[tuple[Path, np.ndarray, dict]]:
+    """The shards still to be rendered, as arguments of `_write_shard`."""
+    size = settings["scenes_per_shard"]
+    shards = [seeds[i : i + size] for i in range(0, len(seeds), size)]
+    stems = [path / f"shard_{k:05d}" for k in range(len(shards))]
+    return [
+        (stem, shard, settings)
+        for stem, shard in zip(stems, shards, strict=True)
+        if not _is_complete(stem, shard)
+    ]
+
+
+def _is_complete(stem: Path, seeds: np.ndarray) -> bool:
+    cameras = stem.with_suffix(".npz")
+    if not cameras.exists():
+        return False
+    with np.load(cameras) as stored:
+        return np.array_equal(stored["seeds"], seeds)
+
+
+def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
+    from roge_jax.data.procedural import sample_sequence
+
+    stem, seeds, settings = job
+    began = time.perf_counter()
+    f, h, w = (settings[name] for name in ("frames", "height", "width"))
+    depth = settings["depth"]
+    kinds = {"rgb": (np.uint8, (f, h, w, 3))} | (
+        {"depth": (np.float16, (f, h, w))} if depth else {}
+    )
+    maps = {
+        name: np.lib.format.open_memmap(
+            stem.with_suffix(f".{name}.npy.part"), "w+", dtype, (len(seeds), *shape)
+        )
+        for name, (dtype, shape) in kinds.items()
+    }
+    cameras: dict[str, list] = {"K": [], "c2w": []}
+    for row, seed in enumerate(seeds):
+        views = sample_sequence(
+            int(seed),
+            frames=f,
+            height=h,
+            width=w,
+            supersample=settings["supersample"],
+            depth=depth,
+        )
+        for name, store in maps.items():
+            store[row] = views[name]
+        for name, values in cameras.items():
+            values.append(views[name])
+    for name, store in maps.items():
+        store.flush()
+        part = stem.with_suffix(f".{name}.npy.part")
+        part.rename(part.with_suffix(""))
+    part = stem.with_suffix(".npz.part")
+    with part.open("wb") as file:
+        np.savez(file, seeds=seeds, K=np.stack(cameras["K"]), c2w=np.stack(cameras["c2w"]))
+    part.rename(part.with_suffix(""))
+    return stem.name, time.perf_counter() - began
+
+
+def read_pool(path: str | Path) -> Pool:
+    """The finished shards of a pool written by `write_pool` (also while it is being written).
+
+    Raises:
+        UserError: the folder has no finished shard.
+    """
+    path = Path(path)
+    stems = sorted(p.with_suffix("") for p in path.glob("shard_*.npz"))
+    if not stems:
+        raise UserError(
+            f"{path} holds no finished shard_*.npz; write one with "
+            f"`python -m roge_jax.data.procedural pool --out {path}`."
+        )
+    cameras = []
+    for stem in stems:
+        with np.load(stem.with_suffix(".npz")) as stored:
+            cameras.append({name: stored[name] for name in ("seeds", "K", "c2w")})
+    lengths = [len(entry["seeds"]) for entry in cameras]
+    depth = [p for stem in stems if (p := stem.with_suffix(".depth.npy")).exists()]
+    return Pool(
+        rgb=[np.load(stem.with_suffix(".rgb.npy"), mmap_mode="r") for stem in stems],
+        depth=[np.load(p, mmap_mode="r") for p in depth],
+        starts=np.cumsum([0, *lengths[:-1]]),
+        **{name: np.concatenate([entry[name] for entry in cameras]) for name in cameras[0]},
+    )
+
+
+def _sheet(out: Path, seeds: Sequence[int], *, views: int, height: int, width: int) -> None:
+    """A contact sheet: one row of views per scene."""
+    from PIL import Image
+
+    from roge_jax.data.procedural import sample_sequence
+
+    rows = []
+    for seed in seeds:
+        scene = sample_sequence(seed, frames=views, height=height, width=width, supersample=3)
+        rows.append(np.concatenate(list(scene["rgb"]), 1))
+    half = (len(rows) + 1) // 2  # two scenes beside each other
+    rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
+    sheet = np.concatenate([np.concatenate(rows[:half]), np.concatenate(rows[half:])], 1)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    image = Image.fromarray(sheet).quantize(255, kmeans=2, dither=Image.Dither.NONE)
+    image.save(out, optimize=True)
+    print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}, {out.stat().st_size} bytes")
+
+
+def _bench(height: int, width: int, frames: int, supersample: int) -> dict:
+    """Frames per second of this process, compilation excluded."""
+    import jax
+
+    from roge_jax.data.procedural import sample_sequence
+
+    options: dict[str, Any] = {"frames": frames, "height": height, "width": width}
+    options |= {"supersample": supersample, "depth": False}
+    began = time.perf_counter()
+    sample_sequence(0, **options)
+    compiled, cpu = time.perf_counter(), time.process_time()
+    count = 0
+    while time.perf_counter() - compiled < 5:
+        count += 1
+        sample_sequence(count, **options)
+    seconds = time.perf_counter() - compiled
+    return {
+        **{k: options[k] for k in ("height", "width", "supersample")},
+        "device": jax.devices()[0].device_kind,
+        "first_call_seconds": round(compiled - began, 2),
+        "frames_per_second": round(count * frames / seconds, 1),
+        "frames_per_cpu_second": round(count * frames / (time.process_time() - cpu), 1),
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """`python -m roge_jax.data.procedural {pool,sheet,bench}`."""
+    parser = argparse.ArgumentParser(prog="python -m roge_jax.data.procedural")
+    commands = parser.add_subparsers(dest="command", required=True)
+    pool = commands.add_parser("pool", help="render many sequences into a folder")
+    pool.add_argument("--out", type=Path, required=True)
+    pool.add_argument("--scenes", type=int, default=2000)
+    pool.add_argument("--first-seed", type=int, default=0)
+    pool.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    pool.add_argument("--scenes-per-shard", type=int, default=100)
+    pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
+    sheet = commands.add_parser("sheet", help="draw a contact sheet")
+    sheet.add_argument("--out", type=Path, required=True)
+    sheet.add_argument("--scenes", type=int, default=8)
+    sheet.add_argument("--first-seed", type=int, default=0)
+    bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
+    for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
+        command.add_argument("--frames", type=int, default=frames)
+        command.add_argument("--height", type=int, default=64)
+        command.add_argument("--width", type=int, default=112)
+    for command in (pool, bench):
+        command.add_argument("--supersample", type=int, default=2)
+    args = parser.parse_args(arguments)
+    try:
+        _run(args)
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
+
+
+def _run(args: argparse.Namespace) -> None:
+    if args.command == "pool":
+        write_pool(
+            args.out,
+            range(args.first_seed, args.first_seed + args.scenes),
+            args.frames,
+            args.height,
+            args.width,
+            args.processes,
+            supersample=args.supersample,
+            scenes_per_shard=args.scenes_per_shard,
+            depth=args.depth,
+        )
+    elif args.command == "sheet":
+        seeds = range(args.first_seed, args.first_seed + args.scenes)
+        _sheet(args.out, seeds, views=args.frames, height=args.height, width=args.width)
+    else:
+        print(json.dumps(_bench(args.height, args.width, args.frames, args.supersample)))
