@@ -6,6 +6,7 @@ paper's end-to-end step; `hires` is its second stage, at higher resolution with 
 """
 
 import dataclasses
+import functools
 from dataclasses import dataclass, field
 
 import jax
@@ -99,9 +100,9 @@ _SCRATCH = OptimConfig(
 )
 
 
-def mini_stages(scale: float = 1.0) -> list[Stage]:
+def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
-    video = ViewConfig(targets=17, ordered=True)
+    video = ViewConfig(targets=frames, ordered=True)
     images, short = ViewConfig(targets=1), ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
     stages = [
@@ -116,18 +117,15 @@ def mini_stages(scale: float = 1.0) -> list[Stage]:
     return [dataclasses.replace(s, steps=max(1, round(s.steps * scale))) for s in stages]
 
 
-def lora_stage(steps: int, batch: int = 1) -> Stage:
-    """The paper's recipe (Sec. 3.3): LoRA on both halves, E1 and the new embeddings fully, AdamW."""
-    return Stage(
-        "lora",
-        "joint",
-        model.NEW_EMBEDDINGS,
-        steps,
-        batch,
-        OptimConfig(),
-        ViewConfig(targets=17, ordered=True),
-        lora=True,
-    )
+def lora_stage(steps: int, *, frames: int = 17, hires: bool = False) -> Stage:
+    """The paper's recipe (Sec. 3.3): LoRA on both halves, E1 and the new embeddings fully, AdamW.
+
+    `hires` is its second stage: the reconstruction stays as it is.
+    """
+    views = ViewConfig(targets=frames, ordered=True)
+    name = "hires" if hires else "lora"
+    optim = OptimConfig(ema=0.0)
+    return Stage(name, "joint", model.NEW_EMBEDDINGS, steps, 1, optim, views, lora=True)
 
 
 def find_stage(stages: list[Stage], name: str) -> Stage:
@@ -159,5 +157,47 @@ def stage_batch(pool, stage: Stage, config: RoGeConfig, seed: int, index: int) -
 
 
 def new_leaves(config: RoGeConfig, stage: Stage) -> Tree:
-    """Specs of leaves that the stage adds to the model: LoRA factors, or nothing."""
-    return model.adapter_specs(config) if stage.lora else {}
+    """Specs of the LoRA factors that a stage adds to the model."""
+    adapters = model.adapter_specs(config)
+    return {"dit": adapters["dit"]} if stage.name == "hires" else adapters
+
+
+def measure_latents(params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32) -> RoGeConfig:
+    """`config` with the mean and standard deviation per latent channel that this VAE has on training clips."""
+    stage = Stage("", "vae", "", 1, 1, OptimConfig(), ViewConfig(targets=config.frames, ordered=True))
+    encode = jax.jit(functools.partial(vae.encode_moments, cfg=config.vae))
+    found = []
+    for i in range(clips):
+        clip = stage_batch(source, stage, config, seed + 1, i)["target_rgb"][0]
+        moments = np.asarray(encode(params["vae"], 2.0 * clip - 1.0))
+        found.append(moments[..., : config.vae.latent].reshape(-1, config.vae.latent))
+    values = np.concatenate(found).astype(np.float64)
+    latents = dataclasses.replace(
+        config.vae,
+        latent_mean=tuple(float(x) for x in values.mean(0).round(4)),
+        latent_std=tuple(float(x) for x in values.std(0).round(4)),
+    )
+    return dataclasses.replace(config, vae=latents)
+
+
+def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16):
+    """evaluate(trainable) -> the stage's own terms on held-out procedural scenes, prefixed `held_`."""
+    from ..data.procedural import HELDOUT_SEED, sample_sequence
+
+    size = {"height": config.height, "width": config.width, "frames": max(24, config.frames + 3)}
+    pool = [sample_sequence(HELDOUT_SEED + i, **size) for i in range(scenes)]
+    views = dataclasses.replace(
+        stage.views, contexts=(3,), context_weights=(1.0,), augment=False, near=0.0, size=None
+    )
+    fixed = dataclasses.replace(stage, views=views, batch=4)
+    batches = [stage_batch(pool, fixed, config, 0, i) for i in range(scenes // 4)]
+    run = jax.jit(objective)
+
+    def evaluate(trainable: Tree) -> dict[str, float]:
+        results = [run(trainable, frozen, batch, jax.random.key(0)) for batch in batches]
+        row = {"held_loss": float(np.mean([loss for loss, _ in results]))}
+        for name in results[0][1]:
+            row[f"held_{name}"] = float(np.mean([terms[name] for _, terms in results]))
+        return row
+
+    return evaluate

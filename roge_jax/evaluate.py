@@ -1,0 +1,218 @@
+"""Evaluate: `python -m roge_jax.evaluate --scenes procedural:1000000000..1000000049 DIR ... --out results.json`.
+
+Per scene, `context` photos are spread over a run of up to frames + context consecutive views and the others are
+generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,
+`mean_context`, `plane` at the true median depth or, without depth, swept; `depth_warp` where depth is complete) and
+beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
+"""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import UserError
+
+HELD_OUT = "procedural:1000000000..1000000049"
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.evaluate", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    p.add_argument("--checkpoint", default="mini", help="model folder or name (default: mini)")
+    p.add_argument(
+        "--scenes",
+        nargs="+",
+        default=[HELD_OUT],
+        help=f"scene folders, 'motorcycle', procedural:SEED or procedural:FIRST..LAST\n(default: {HELD_OUT})",
+    )
+    p.add_argument("--context", type=int, default=3, help="photos per scene (default: 3)")
+    p.add_argument("--steps", type=int, default=20, help="sampling steps (default: 20)")
+    p.add_argument("--solver", default="euler", help="sampler (default: euler)")
+    p.add_argument("--seed", type=int, default=0, help="seed of the noise")
+    p.add_argument("--sweep", type=float, nargs=2, help="degrees that procedural paths turn, LOW HIGH")
+    p.add_argument("--out", type=Path, default=Path("results.json"), help="results file (default: results.json)")
+    p.add_argument("--sheet", type=Path, help="also write a contact sheet of the scenes (PNG)")
+    p.add_argument("--debug", action="store_true", help="show tracebacks")
+    return p
+
+
+def expand(specs: list[str]) -> list[str]:
+    """Scene names with procedural:FIRST..LAST written out."""
+    names = []
+    for spec in specs:
+        if spec.startswith("procedural:") and ".." in spec:
+            first, _, last = spec.removeprefix("procedural:").partition("..")
+            if not (first.isdigit() and last.isdigit() and int(first) <= int(last)):
+                raise UserError(f"'{spec}' is no range of seeds: write procedural:FIRST..LAST.")
+            names += [f"procedural:{seed}" for seed in range(int(first), int(last) + 1)]
+        else:
+            names.append(spec)
+    return names
+
+
+def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]]:
+    """(context ids, target ids) of a scene: a centred run of views, contexts in the middle of equal parts of it."""
+    run = min(views, frames + contexts)
+    if run <= contexts:
+        raise UserError(
+            f"{views} views cannot give {contexts} contexts and a target: use fewer with --context."
+        )
+    start = (views - run) // 2
+    context = [start + int((i + 0.5) * run / contexts) for i in range(contexts)]
+    return context, [i for i in range(start, start + run) if i not in context]
+
+
+def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) -> dict[str, Any]:
+    """One scene at generation size: rgb [v, h, w, 3], K, c2w (float64), contexts first, and depth or None."""
+    from .data import scene as scenes
+
+    if name.startswith("procedural:"):
+        from .data.procedural import sample_sequence
+
+        seed = name.removeprefix("procedural:")
+        if not seed.isdigit():
+            raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.")
+        options = {} if sweep is None else {"sweep": tuple(sweep)}
+        made = sample_sequence(
+            int(seed), frames=frames + contexts, height=size[0], width=size[1], **options
+        )
+        context, target = spread(frames + contexts, contexts, frames)
+        order = context + target
+        return {
+            "rgb": made["rgb"][order].astype(np.float32) / 255.0,
+            "K": made["K"][order],
+            "c2w": made["c2w"][order],
+            "depth": made["depth"][target],
+            "context": context,
+            "target": target,
+        }
+    scene = scenes.load_scene(name)
+    context, target = spread(len(scene), contexts, frames)
+    images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
+    return {
+        "rgb": images,
+        "K": np.asarray(cameras.K),
+        "c2w": np.asarray(cameras.c2w),
+        "depth": None,
+        "context": context,
+        "target": target,
+    }
+
+
+class Evaluator:
+    """The model's jitted pieces, compiled once for all scenes of a size."""
+
+    def __init__(self, checkpoint: str, solver: str, steps: int, seed: int):
+        import functools
+
+        import jax
+
+        from . import model
+        from .checkpoint import load_model
+        from .video import flow, solvers, vae
+
+        self.params, self.config = load_model(checkpoint)
+        config = self.config
+        table = solvers.tabulate(solver, flow.schedule("shift", steps, shift=config.flow.shift))
+        self.prepare = jax.jit(functools.partial(model.prepare, config=config))
+        self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
+        self.decode = jax.jit(functools.partial(model.decode_video, config=config))
+        self.rgb = jax.jit(functools.partial(model.decode_rgb, config=config))
+        self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
+        self.key = jax.random.key(seed)
+        self.noise = functools.partial(model.draw_noise, config=config)
+        self.raise_if_failed = solvers.raise_if_failed
+
+    def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
+        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the scene's targets."""
+        from .data.views import make_sample
+        from .geometry.cameras import Cameras
+        from .geometry.crops import resize
+        from .geometry.packing import pad_path
+
+        m, n, frames = len(scene["context"]), len(scene["target"]), self.config.frames
+        path = pad_path(Cameras(scene["K"][m:], scene["c2w"][m:]), frames)
+        K, c2w = np.concatenate([scene["K"][:m], path.K]), np.concatenate([scene["c2w"][:m], path.c2w])
+        rgb = np.concatenate([scene["rgb"], np.repeat(scene["rgb"][-1:], frames - n, 0)])
+        views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
+        truth = views.pop("target_rgb")
+        prepared = self.prepare(self.params, views)
+        latents, info = self.generate(self.params, prepared, self.noise(self.key, m))
+        self.raise_if_failed(info)
+        h, w = truth.shape[1:3]
+        head = np.asarray(self.rgb(self.params, prepared.features[m:]))
+        return {
+            "generated": np.asarray(self.decode(self.params, latents))[:n],
+            "rgb_head": np.stack([resize(image, h, w) for image in head[:n]]),
+            "vae_round_trip": np.asarray(
+                self.decode(self.params, self.encode(self.params["vae"], 2.0 * truth - 1.0))
+            )[:n],
+        }
+
+
+def main(args: argparse.Namespace) -> dict[str, Any]:
+    from tqdm import tqdm
+
+    from .metrics import image, report
+    from .metrics.baselines import baselines
+
+    evaluator = Evaluator(args.checkpoint, args.solver, args.steps, args.seed)
+    config = evaluator.config
+    size = (config.height, config.width)
+    results, rows, methods = [], [], []
+    names = expand(args.scenes)
+    for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
+        scene = read(name, args.context, config.frames, size, args.sweep)
+        m = len(scene["context"])
+        truth = scene["rgb"][m:]
+        videos = evaluator.videos(scene)
+        simple, depths = baselines(
+            scene["rgb"][:m], scene["K"][:m], scene["c2w"][:m], scene["K"][m:], scene["c2w"][m:], size, scene["depth"]
+        )
+        row = {
+            "scene": Path(name).name or name,
+            "context": scene["context"],
+            "target": scene["target"],
+        }
+        for method, frames in (videos | simple).items():
+            row[method] = image.image_metrics(np.clip(frames, 0.0, 1.0), truth)
+        results.append(row)
+        middle = len(truth) // 2
+        shown = videos | simple
+        methods += [method for method in shown if method not in methods]
+        rows.append([*scene["rgb"][:m], truth[middle], *(shown[k][middle] for k in shown)])
+    settings = {
+        "checkpoint": str(args.checkpoint),
+        "model": config.name,
+        "size": list(size),
+        "context": args.context,
+        "frames": config.frames,
+        "solver": args.solver,
+        "steps": args.steps,
+        "seed": args.seed,
+        "sweep": args.sweep,
+        "metrics": image.SETTINGS,
+    }
+    document = report.build(settings, results, models=("generated", "rgb_head"))
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    report.write_json(args.out, document)
+    print(report.table(document))
+    print(f"wrote {args.out}")
+    if args.sheet:
+        from PIL import Image
+
+        args.sheet.parent.mkdir(parents=True, exist_ok=True)
+        labels = [*(f"photo {i}" for i in range(args.context)), "truth", *methods]
+        sheet = report.contact_sheet(rows[:12], labels, row_labels=[r["scene"] for r in results[:12]])
+        Image.fromarray(sheet).save(args.sheet, optimize=True)
+        print(f"wrote {args.sheet}")
+    return document
+
+
+if __name__ == "__main__":
+    from .entry import run
+
+    run(main, parser())

@@ -1,0 +1,211 @@
+"""Train: `python -m roge_jax.train PRESET`, by default the paper's recipe on top of the shipped weights.
+
+    python -m roge_jax.train mini                          LoRA + new embeddings, end to end, from the shipped model
+    python -m roge_jax.train mini --stage all --init scratch --out runs/mini     the recipe of the shipped model
+    python -m roge_jax.train mini --stage recon --init runs/mini/recon_low/model  one stage from any model folder
+    python -m roge_jax.train tiny --steps 20               seconds, random weights
+
+Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) and model/ (weights + config to load).
+"""
+
+import argparse
+import dataclasses
+import functools
+import os
+from pathlib import Path
+
+RECIPES = ("lora", "hires", "all")
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.train", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    p.add_argument("preset", help="tiny, mini, wan1.3b or paper")
+    p.add_argument(
+        "--stage",
+        default="lora",
+        help="lora (default): LoRA on both halves + new embeddings, the paper's joint training;\n"
+        "hires: the same with the reconstruction frozen, at --size;\n"
+        "vae_images, vae_clips, recon_low, recon, prior, generator, joint: one stage of the recipe\n"
+        "that makes a small model from nothing; all: all of them in order",
+    )
+    p.add_argument("--init", help="model folder or name to start from, or 'scratch' (default: the preset's own)")
+    p.add_argument("--data", type=Path, help="pool written by roge_jax.data.procedural (default: render as we go)")
+    p.add_argument("--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)")
+    p.add_argument("--steps", type=int, help="optimiser steps (default: the stage's own)")
+    p.add_argument("--scale", type=float, default=1.0, help="multiplies the steps of every stage of --stage all")
+    p.add_argument("--batch", type=int, help="scenes per step (default: the stage's own)")
+    p.add_argument("--lr", type=float, help="learning rate (default: the stage's own)")
+    p.add_argument("--size", help="HEIGHTxWIDTH of stage hires (default: 1.5 times the model's)")
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
+    p.add_argument("--devices", type=int, help="devices to split the batch over (default: all)")
+    p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
+    p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
+    p.add_argument("--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes")
+    p.add_argument("--tensorboard", action="store_true", help="also write TensorBoard events (extra 'log')")
+    p.add_argument("--debug", action="store_true", help="show tracebacks")
+    return p
+
+
+class ProceduralSource:
+    """Endless sequences rendered when they are asked for; item i is scene seed i of the training split."""
+
+    def __init__(self, height: int, width: int, frames: int):
+        self.settings = {"height": height, "width": width, "frames": frames}
+
+    def __len__(self) -> int:
+        return 10**9  # held-out seeds begin here
+
+    def __getitem__(self, index: int) -> dict:
+        from .data.procedural import sample_sequence
+
+        return sample_sequence(index, **self.settings)
+
+
+def main(args: argparse.Namespace) -> None:
+    if args.devices and "jax" not in globals():
+        os.environ["XLA_FLAGS"] = (
+            f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={args.devices}"
+        )
+    import jax
+
+    from . import checkpoint, config
+    from .training import stages as stages_
+
+    preset = config.preset(args.preset)
+    init = args.init or ("mini" if args.preset == "mini" and args.stage != "all" else "scratch")
+    if init == "scratch":
+        from . import model
+
+        params, cfg = model.init(jax.random.key(args.seed), preset), preset
+    else:
+        params, cfg = checkpoint.load_model(init)
+    recipe = stages_.mini_stages(args.scale, frames=cfg.frames)
+    if args.stage == "all":
+        chosen = recipe
+    elif args.stage in ("lora", "hires"):
+        chosen = [stages_.lora_stage(200, frames=cfg.frames, hires=args.stage == "hires")]
+    else:
+        chosen = [stages_.find_stage(recipe, args.stage)]
+    if args.stage == "hires":
+        cfg = resize(cfg, args.size)
+    for stage in chosen:
+        params, cfg = run_stage(args, stage, params, cfg)
+
+
+def resize(cfg, size: str | None):
+    """The configuration at another size, of generation and reconstruction alike."""
+    from .errors import UserError
+
+    if size is None:
+        height, width = (round(1.5 * x / 16) * 16 for x in (cfg.height, cfg.width))
+    else:
+        try:
+            height, width = (int(x) for x in size.lower().split("x"))
+        except ValueError:
+            raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
+    return dataclasses.replace(
+        cfg,
+        height=height,
+        width=width,
+        recon_height=height * cfg.recon_height // cfg.height // 8 * 8,
+        recon_width=width * cfg.recon_width // cfg.width // 8 * 8,
+    )
+
+
+def run_stage(args, stage, params, cfg):
+    """Train one stage and save its model; returns (params, config) for the next."""
+    import jax
+
+    from . import checkpoint, model
+    from .core.lora import attach, merge
+    from .core.params import count, flatten
+    from .core.params import init as init_specs
+    from .data.pool import read_pool
+    from .errors import UserError
+    from .training import loop, stages
+
+    out = args.out / stage.name
+    done = out / "model" / "config.json"
+    if args.resume and args.stage == "all" and done.exists():
+        print(f"{stage.name}: already trained, {done.parent}")
+        return checkpoint.load_model(done.parent)
+    changes = {"steps": args.steps, "batch": args.batch}
+    stage = dataclasses.replace(stage, **{k: v for k, v in changes.items() if v})
+    if args.lr:
+        stage = dataclasses.replace(stage, optim=dataclasses.replace(stage.optim, learning_rate=args.lr))
+    devices = args.devices or jax.device_count()
+    if stage.batch % devices:
+        raise UserError(
+            f"A batch of {stage.batch} cannot be split over {devices} devices: use --batch "
+            f"{max(devices, stage.batch // devices * devices)} or --devices 1."
+        )
+    working = stages.stage_config(cfg, stage)
+    if args.data:
+        source = read_pool(args.data)
+    else:
+        source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
+    trainable, frozen = model.split(params, stage.trains)
+    specs, _ = model.split(model.specs(cfg), stage.trains)
+    if stage.lora:
+        added = stages.new_leaves(cfg, stage)
+        trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
+        specs = attach(specs, added)
+    if stage.objective in ("vae", "recon"):
+        frozen = {}
+    print(
+        f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
+        f"{stage.batch} scenes at {working.height}x{working.width}, {devices} x {jax.devices()[0].device_kind}"
+    )
+    objective = functools.partial(stages.OBJECTIVES[stage.objective], config=working, stage=stage)
+    mesh = None
+    if devices > 1:
+        axis = (jax.sharding.AxisType.Auto,)
+        mesh = jax.make_mesh((devices,), ("data",), axis_types=axis, devices=jax.devices()[:devices])
+    writer = None
+    if args.tensorboard:
+        from tensorboardX import SummaryWriter
+
+        writer = SummaryWriter(str(out / "tensorboard"))
+    evaluate = None
+    if args.evaluate_every:
+        evaluate = stages.held_out(objective, frozen, stage, working)
+    state = loop.train(
+        objective,
+        trainable,
+        frozen,
+        specs,
+        lambda i: stages.stage_batch(source, stage, working, args.seed, i),
+        optim=stage.optim,
+        loop=loop.LoopConfig(
+            steps=stage.steps, seed=args.seed, log_every=args.log_every, save_every=args.save_every
+        ),
+        out=out,
+        resume=args.resume,
+        mesh=mesh,
+        name=stage.name,
+        evaluate=evaluate,
+        evaluate_every=args.evaluate_every,
+        writer=writer,
+    )
+    learned = state.get("ema", state["params"])
+    learned = jax.device_get(learned)
+    lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
+    full = {path: x for path, x in flatten(learned).items() if path not in lora}
+    from .core.params import unflatten
+
+    params = merge(attach(params, unflatten(full)), unflatten(lora))
+    if stage.objective == "vae":
+        cfg = stages.measure_latents(params, source, cfg, args.seed)
+    provenance = {"stage": stage.name, "steps": int(state["step"]), "skipped": int(state["skipped"])}
+    checkpoint.save_model(out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance)
+    print(f"{stage.name}: saved {out / 'model'}")
+    return params, cfg
+
+
+if __name__ == "__main__":
+    from .entry import run
+
+    run(main, parser())
