@@ -34,6 +34,7 @@ class Stage:
     views: ViewConfig = field(default_factory=ViewConfig)
     draws: int = 1  # noise levels per scene and step
     lora: bool = False  # add LoRA factors to what trains
+    remat: str = "dots"  # what the transformer's backward pass recomputes: none, dots or full
     recon_shrink: int = 1  # divides the size at which the reconstruction works
 
 
@@ -76,7 +77,9 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
         x0 = jax.lax.stop_gradient(jnp.concatenate(latents))
         cond = model.unconditioned(x0[:m], x0.shape[0], config=config)
         return jax.lax.map(
-            lambda key: model.flow_matching(params, x0, cond, key, config=config, contexts=m),
+            lambda key: model.flow_matching(
+                params, x0, cond, key, config=config, contexts=m, remat=stage.remat
+            ),
             jax.random.split(key, stage.draws),
         ).mean()
 
@@ -85,7 +88,9 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
 
 
 def joint_objective(trainable, frozen, batch, key, *, config, stage):
-    return model.loss(trainable, frozen, batch, key, config=config, draws=stage.draws)
+    return model.loss(
+        trainable, frozen, batch, key, config=config, draws=stage.draws, remat=stage.remat
+    )
 
 
 OBJECTIVES = {
