@@ -1,0 +1,69 @@
+"""Test-suite settings. The environment is set before JAX is imported; settings made outside win.
+
+What runs: the fast suite by default; `-m slow`, `-m parity` (or a test named by its node id) selects the rest. Tests on
+developer data look for `ROGE_DEV_DATA`, a folder with `parity/` and `scenes/`, and skip with that reason without it.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+HOST_DEVICES = 8
+
+assert "jax" not in sys.modules, "a pytest plugin imported jax before its settings were made"
+
+_SETTINGS = {
+    "JAX_PLATFORMS": "cpu",
+    "JAX_NUMPY_RANK_PROMOTION": "raise",  # broadcasting is written out in this code base
+    "JAX_DEFAULT_MATMUL_PRECISION": "highest",
+    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".jax_cache" / "tests"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.3",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MPLBACKEND": "Agg",
+}
+# Compiling is most of the suite's time on small shapes; level 1 leaves out what only pays on large ones.
+_XLA_FLAGS = {
+    "xla_force_host_platform_device_count": HOST_DEVICES,
+    "xla_backend_optimization_level": 1,
+}
+
+for name, value in _SETTINGS.items():
+    os.environ.setdefault(name, value)
+given = os.environ.get("XLA_FLAGS", "")
+missing = [f"--{flag}={value}" for flag, value in _XLA_FLAGS.items() if flag not in given]
+os.environ["XLA_FLAGS"] = " ".join([given, *missing]).strip()
+
+sys.path.insert(0, str(Path(__file__).parent))  # helper modules beside the tests
+
+
+def pytest_configure(config):
+    from hypothesis import settings
+
+    # The first example compiles, so times of single examples say nothing.
+    settings.register_profile("roge", deadline=None, database=None, derandomize=True)
+    settings.load_profile("roge")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Leave out `slow` and `parity` tests unless a mark expression or a node id asks for them."""
+    if config.option.markexpr or any("::" in str(arg) for arg in config.invocation_params.args):
+        return
+    chosen, left = [], []
+    for item in items:
+        extra = item.get_closest_marker("slow") or item.get_closest_marker("parity")
+        (left if extra else chosen).append(item)
+    if left:
+        config.hook.pytest_deselected(items=left)
+        items[:] = chosen
+
+
+@pytest.fixture(scope="session")
+def dev_data() -> Path:
+    """The optional developer data; skips the test without it."""
+    root = os.environ.get("ROGE_DEV_DATA")
+    if not root:
+        pytest.skip("needs developer data: set ROGE_DEV_DATA to its folder")
+    return Path(root)
