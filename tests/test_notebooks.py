@@ -1,0 +1,29 @@
+"""The notebooks run from the first cell to the last, and their two forms are the same."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_runs(source, tmp_path):
+    environment = os.environ | {"MPLBACKEND": "agg"}
+    environment.pop("XLA_FLAGS", None)
+    done = subprocess.run(
+        [sys.executable, str(source)], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
+def test_paired_notebook_has_the_same_cells_and_no_outputs(source):
+    jupytext = pytest.importorskip("jupytext")
+    script = jupytext.read(source)
+    paired = jupytext.read(source.with_suffix(".ipynb"))
+    assert [c.source for c in script.cells] == [c.source for c in paired.cells]
+    assert all(not c.get("outputs") for c in paired.cells)
