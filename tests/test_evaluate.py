@@ -1,0 +1,55 @@
+"""The evaluation program: its contract, its protocol, its errors."""
+
+import json
+
+import jax
+import pytest
+
+from roge_jax import evaluate
+from roge_jax.checkpoint import save_model
+from roge_jax.config import preset
+from roge_jax.errors import UserError
+from roge_jax.model import init
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models") / "tiny"
+    config = preset("tiny")
+    save_model(folder, init(jax.random.key(0), config), config)
+    return folder
+
+
+def test_results_follow_the_contract(tiny, tmp_path, capsys):
+    out, sheet = tmp_path / "results.json", tmp_path / "sheet.png"
+    args = ["--checkpoint", str(tiny), "--scenes", "procedural:1000000000..1000000001", "--context", "2"]
+    args += ["--steps", "2", "--out", str(out), "--sheet", str(sheet)]
+    evaluate.main(evaluate.parser().parse_args(args))
+    results = json.loads(out.read_text())
+    methods = {"generated", "rgb_head", "nearest", "mean_context", "plane", "vae_round_trip"}
+    assert methods <= set(results["means"])
+    assert len(results["scenes"]) == 2
+    for scene in results["scenes"]:
+        assert len(scene["context"]) == 2 and not set(scene["context"]) & set(scene["target"])
+        for method in methods:
+            assert 0 < scene[method]["psnr"] < 100 and -1 <= scene[method]["ssim"] <= 1
+    mean = sum(scene["plane"]["psnr"] for scene in results["scenes"]) / 2
+    assert results["means"]["plane"]["psnr"] == pytest.approx(mean)
+    assert results["intervals"]["generated"]["psnr"]["n"] == 2
+    assert sheet.read_bytes()[:4] == b"\x89PNG"
+    assert "plane" in capsys.readouterr().out
+
+
+def test_contexts_are_spread_and_targets_are_the_rest():
+    assert evaluate.spread(20, 3, 17) == ([3, 10, 16], [i for i in range(20) if i not in (3, 10, 16)])
+    context, target = evaluate.spread(50, 3, 17)
+    assert len(target) == 17 and min(context + target) == 15 and max(context + target) == 34
+    with pytest.raises(UserError, match="--context"):
+        evaluate.spread(3, 3, 17)
+
+
+@pytest.mark.parametrize("spec", ["procedural:5..2", "procedural:a..b"])
+def test_a_wrong_range_of_seeds_is_named(spec):
+    with pytest.raises(UserError, match="FIRST..LAST"):
+        evaluate.expand([spec])
+    assert evaluate.expand(["procedural:3..4", "x"]) == ["procedural:3", "procedural:4", "x"]

@@ -1,0 +1,46 @@
+"""The training program on the tiny preset: a few real steps, resume, what it writes, what it refuses."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from roge_jax import train
+from roge_jax.checkpoint import load_model
+from roge_jax.core.params import flatten
+from roge_jax.errors import UserError
+
+
+def run(*arguments) -> None:
+    train.main(train.parser().parse_args([str(a) for a in arguments]))
+
+
+def losses(folder) -> list[float]:
+    return [json.loads(line)["loss"] for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def common():
+    return ["tiny", "--devices", 1, "--log-every", 1, "--save-every", 1]
+
+
+def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
+    run(*common, "--steps", 4, "--out", tmp_path / "whole")
+    run(*common, "--steps", 2, "--out", tmp_path / "parts")
+    run(*common, "--steps", 4, "--out", tmp_path / "parts", "--resume")
+    whole, parts = losses(tmp_path / "whole/lora"), losses(tmp_path / "parts/lora")
+    # The learning rate's warm-up depends on the planned number of steps, so only runs with one plan agree.
+    assert len(whole) == len(parts) == 4 and all(np.isfinite(whole + parts))
+    assert whole[0] == parts[0]
+    params, config = load_model(tmp_path / "whole/lora/model")
+    assert config.name == "tiny"
+    assert not any("lora" in path for path in flatten(params))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
+
+
+def test_unknown_stage_and_batch_that_does_not_divide_are_refused(tmp_path):
+    with pytest.raises(UserError, match="recon"):
+        run("tiny", "--stage", "recom", "--out", tmp_path)
+    with pytest.raises(UserError, match="mini"):
+        run("minni", "--out", tmp_path)
