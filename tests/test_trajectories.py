@@ -156,6 +156,9 @@ def test_focus_distance():
     outward = moved(CONTEXT)
     outward.c2w[:, :3, [0, 2]] *= -1  # looking away from the origin: axes cross behind
     assert focus_distance(outward) > 0
+    odd = looking_at_origin(6)
+    odd.c2w[0, :3, [0, 2]] *= -1  # only the start camera looks away from what the others share
+    assert focus_distance(odd) > 0 and focus_distance(odd, 3) == pytest.approx(4.0, rel=1e-6)
 
 
 def test_world_up():
@@ -183,6 +186,22 @@ def test_interpolation_meets_its_keys(seed):
     effort = moves + turns
     assert nearest.max() < 2 * effort.max() * max(1.0, unit)
     assert effort.max() < 1.1 * effort.mean()
+
+
+def test_unevenly_spaced_keys_make_no_loops():
+    """Keys at distances from 1 to 30: the path is on average less than 5 % longer than the straight
+    connections (10 % if knots were spaced by distance instead of its root, 12 % if evenly)."""
+    rng = np.random.default_rng(0)
+    ratios = []
+    for _ in range(60):
+        steps = rng.normal(size=(5, 3))
+        steps *= 10 ** rng.uniform(-1.5, 0.0, (5, 1)) / np.linalg.norm(steps, axis=1, keepdims=True)
+        c2w = np.tile(np.eye(4), (6, 1, 1))
+        c2w[1:, :3, 3] = np.cumsum(steps, 0)
+        path = interpolate(Cameras(np.tile(np.eye(3), (6, 1, 1)), c2w), np.linspace(0, 1, 300))
+        travelled = np.linalg.norm(np.diff(path.centres, axis=0), axis=1).sum()
+        ratios.append(travelled / np.linalg.norm(steps, axis=1).sum())
+    assert 1.0 <= np.mean(ratios) < 1.05
 
 
 def test_interpolate_through_duplicates_and_one_view():
