@@ -1,0 +1,274 @@
+"""What a run costs before it runs: tokens, FLOPs and memory of every stage, from the configuration alone.
+
+A multiply-add counts as 2 FLOPs. Norms, activations, rotations and resizing are left out (below 1 % at any size that
+matters). Formulas follow the published networks: VGGT and the LagerNVS renderer, Wan2.1's transformer and VAE.
+`tests/test_cost.py` holds them against published counts.
+"""
+
+import dataclasses
+import math
+import re
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from . import model
+from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
+from .core.params import flatten
+from .recon.vggt import SPECIALS, encoder_grid
+from .video.dit import FLOAT32_LEAVES
+
+SINGLE_PASS_BYTES = 2e9  # a VAE decoder whose largest tensor is above this works one latent frame at a time
+
+
+def attention(queries: int, keys: int, width: int) -> float:
+    """Scores and weighted sum of all heads together."""
+    return 4.0 * queries * keys * width
+
+
+# ---- reconstruction ------------------------------------------------------------------------------
+
+
+def encoder(cfg: EncoderConfig, height: int, width: int, m: int, scene_width: int) -> float:
+    """Scene tokens of m photos of height x width pixels (before the encoder's own resize)."""
+    rows, columns = encoder_grid(cfg, height, width)
+    patches, d = rows * columns, cfg.width
+    tokens = patches + SPECIALS + cfg.registers
+
+    def block(tokens: int) -> float:
+        return 24.0 * d * d * tokens + attention(tokens, tokens, d)
+
+    embed = 2.0 * patches * cfg.patch**2 * (3 if cfg.dino_depth else 9) * d
+    per_view = embed + (cfg.dino_depth + cfg.depth) * block(tokens) + 4.0 * d * scene_width * patches
+    return m * per_view + cfg.depth * block(m * tokens)
+
+
+def renderer_view(cfg: RendererConfig, height: int, width: int, scene_tokens: int) -> float:
+    """Ray features and picture of one view, with a scene refined for this view alone."""
+    rays, d, z = (height // cfg.patch) * (width // cfg.patch), cfg.width, scene_tokens
+    x = rays + cfg.registers
+    cross = d * d * (28.0 * x + 4.0 * z) + attention(x, x + z, d)
+    both = d * d * (32.0 * x + 24.0 * z) + attention(x, x + 2 * z, d)
+    ends = 2.0 * rays * cfg.patch**2 * (6 + 3) * d
+    if cfg.attention == "full":
+        return ends + cfg.depth * (24.0 * d * d * (x + z) + attention(x + z, x + z, d))
+    if cfg.attention == "cross":
+        return ends + cfg.depth * cross
+    return ends + (cfg.depth - 1) * both + cross
+
+
+def renderer(cfg: RendererConfig, height: int, width: int, scene_tokens: int, m: int, views: int) -> float:
+    """Ray features of all views as this program computes them.
+
+    Where the scene is refined once (`shared`) or never (`cross`), its keys and values serve every view of a chunk.
+    """
+    per_view = renderer_view(cfg, height, width, scene_tokens)
+    shared = cfg.attention == "bidirectional" and cfg.refinement == "shared"
+    if cfg.attention == "full" or (cfg.attention == "bidirectional" and not shared):
+        return views * per_view
+    keys = 4.0 * cfg.width**2 * scene_tokens * cfg.depth
+    reading = renderer_view(dataclasses.replace(cfg, attention="cross"), height, width, scene_tokens) - keys
+    chunks = -(-views // cfg.chunk)
+    total = views * reading + chunks * keys
+    return total + m * per_view if shared else total
+
+
+# ---- generation ----------------------------------------------------------------------------------
+
+
+def text(cfg: DiTConfig, rows: int | None = None) -> float:
+    """Text embedding and the keys and values of cross-attention: once per video."""
+    rows = cfg.text_len if rows is None else rows
+    if not rows:
+        return 0.0
+    d = cfg.width
+    clip = 2.0 * cfg.clip_rows * (cfg.clip_dim**2 + cfg.clip_dim * d) * (rows > cfg.text_len)
+    return 2.0 * cfg.text_len * (cfg.text_dim * d + d * d) + clip + cfg.depth * 4.0 * d * d * rows
+
+
+def velocity(cfg: DiTConfig, tokens: int, rows: int | None = None) -> float:
+    """One evaluation of the transformer on `tokens`, with `rows` of text whose keys and values are cached."""
+    rows = cfg.text_len if rows is None else rows
+    d, f = cfg.width, cfg.ffn
+    linear = tokens * ((12.0 if rows else 8.0) * d * d + 4.0 * d * f)
+    blocks = cfg.depth * (linear + attention(tokens, tokens, d) + attention(tokens, rows, d))
+    ends = 2.0 * tokens * cfg.patch**2 * (cfg.in_channels + cfg.out_channels) * d
+    time = 2.0 * (cfg.freq_dim * d + d * d + 6 * d * d)
+    return blocks + ends + time
+
+
+def fusion(config: RoGeConfig, views: int, slots: int) -> float:
+    """Geometry adapter and the patch embeddings of rays and geometry: once per window."""
+    grid = (config.recon_height // config.renderer.patch) * (config.recon_width // config.renderer.patch)
+    c, d, patch = config.fusion.geometry_channels, config.dit.width, config.dit.patch
+    adapter = 2.0 * views * grid * config.renderer.width * c
+    return adapter + 2.0 * tokens_per_slot(config) * slots * patch**2 * (6 * 4 * 64 + 4 * c) * d
+
+
+# ---- VAE -----------------------------------------------------------------------------------------
+
+
+class _Clip(NamedTuple):
+    """Size of a feature map on its way through the VAE."""
+
+    frames: int
+    height: int
+    width: int
+
+    def conv(self, c_in: int, c_out: int, *, dense: bool, time: int = 3, space: int = 9) -> float:
+        """A causal convolution; not `dense`: frames before the first are not multiplied, as this program does it."""
+        taps = time * self.frames if dense else sum(min(t + 1, time) for t in range(self.frames))
+        return 2.0 * taps * space * self.height * self.width * c_in * c_out
+
+    def res(self, c_in: int, c_out: int, *, dense: bool) -> float:
+        short = 0.0 if c_in == c_out else self.conv(c_in, c_out, dense=dense, time=1, space=1)
+        return self.conv(c_in, c_out, dense=dense) + self.conv(c_out, c_out, dense=dense) + short
+
+    def mid(self, c: int, *, dense: bool) -> float:
+        pixels = self.height * self.width
+        attend = self.frames * (8.0 * c * c * pixels + attention(pixels, pixels, c))
+        return 2 * self.res(c, c, dense=dense) + attend
+
+
+def _widths(cfg: VAEConfig) -> list[int]:
+    return [cfg.base * k for k in cfg.multipliers]
+
+
+def vae_encode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False) -> float:
+    """Video (frames = 1 + 4k) to latents."""
+    widths, clip = _widths(cfg), _Clip(frames, height, width)
+    total = clip.conv(3, widths[0], dense=dense)
+    c_in = widths[0]
+    for i, c in enumerate(widths):
+        total += clip.res(c_in, c, dense=dense) + (cfg.res_blocks - 1) * clip.res(c, c, dense=dense)
+        c_in = c
+        if i < len(cfg.temporal):
+            clip = clip._replace(height=clip.height // 2, width=clip.width // 2)
+            total += clip.conv(c, c, dense=dense, time=1)
+            if cfg.temporal[i] and clip.frames > 1:
+                clip = clip._replace(frames=(clip.frames + 1) // 2)
+                total += clip._replace(frames=clip.frames - 1).conv(c, c, dense=True, space=1)
+    z = 2 * cfg.latent
+    total += clip.mid(c_in, dense=dense) + clip.conv(c_in, z, dense=dense)
+    return total + clip.conv(z, z, dense=dense, time=1, space=1)
+
+
+def vae_decode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False) -> float:
+    """Latents to a video of frames = 1 + 4k."""
+    widths, temporal = _widths(cfg)[::-1], cfg.temporal[::-1]
+    scale = 2 ** len(temporal)
+    clip = _Clip(1 + (frames - 1) // 2 ** sum(temporal), height // scale, width // scale)
+    total = clip.conv(cfg.latent, cfg.latent, dense=dense, time=1, space=1)
+    total += clip.conv(cfg.latent, widths[0], dense=dense) + clip.mid(widths[0], dense=dense)
+    for i, c in enumerate(widths):
+        c_in = c if i == 0 else widths[i - 1] // 2
+        total += clip.res(c_in, c, dense=dense) + cfg.res_blocks * clip.res(c, c, dense=dense)
+        if i < len(temporal):
+            if temporal[i] and clip.frames > 1:
+                total += clip._replace(frames=clip.frames - 1).conv(c, 2 * c, dense=dense, space=1)
+                clip = clip._replace(frames=2 * clip.frames - 1)
+            clip = clip._replace(height=2 * clip.height, width=2 * clip.width)
+            total += clip.conv(c, c // 2, dense=dense, time=1)
+    return total + clip.conv(widths[-1], 3, dense=dense)
+
+
+def decoder_tensor_bytes(config: RoGeConfig, frames: int | None = None) -> float:
+    """The decoder's largest tensor, float32: after the last nearest-neighbour up-sampling, before its convolution."""
+    cfg = config.vae
+    widest = cfg.base * cfg.multipliers[min(1, len(cfg.multipliers) - 1)]
+    return 4.0 * (frames or config.frames) * config.height * config.width * widest
+
+
+# ---- a whole run ---------------------------------------------------------------------------------
+
+
+def tokens_per_slot(config: RoGeConfig) -> int:
+    """Transformer tokens of one latent slot."""
+    lh, lw = config.latent_size
+    return (lh // config.dit.patch) * (lw // config.dit.patch)
+
+
+def weight_bytes(config: RoGeConfig, dtype: Any = jnp.float32) -> dict[str, float]:
+    """Bytes of each part's weights when large matrices are `dtype`; the VAE and small leaves stay float32."""
+    sizes: dict[str, float] = {}
+    for path, spec in flatten(model.specs(config)).items():
+        part = path.partition("/")[0]
+        full = part == "vae" or re.search(FLOAT32_LEAVES, path)
+        sizes.setdefault(part, 0.0)
+        sizes[part] += math.prod(spec.shape) * (4 if full else jnp.dtype(dtype).itemsize)
+    return sizes
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """Costs of one window of a run. `flops` and `working_bytes` per stage; the velocity's are per evaluation."""
+
+    tokens: dict[str, int]
+    flops: dict[str, float]
+    evaluations: int
+    weights: dict[str, float]
+    working_bytes: dict[str, float]
+
+    @property
+    def total_flops(self) -> float:
+        """All of one window: the velocity counts `evaluations` times."""
+        return sum(f * (self.evaluations if name == "velocity" else 1) for name, f in self.flops.items())
+
+    @property
+    def peak_bytes(self) -> float:
+        """Weights, and the hungriest stage on top. The runtime's own 0.3 to 0.6 GB are not in it."""
+        return sum(self.weights.values()) + max(self.working_bytes.values())
+
+
+def estimate(
+    config: RoGeConfig, m: int, evaluations: int, *, dtype: Any = jnp.float32, fused_attention: bool = False
+) -> Estimate:
+    """A window with m photos. `fused_attention`: scores are never stored (GPU, bfloat16).
+
+    Working memory counts the tensors that must live at the same time: scores and their exponentials, a block's
+    queries, keys, values and hidden layer, the convolution's input and output in the VAE. It is an estimate; what XLA
+    allocates lies within a factor of two of it.
+    """
+    n, slots = config.frames, config.slots(m)
+    size = (config.recon_height, config.recon_width)
+    rows, columns = encoder_grid(config.encoder, *size)
+    scene_tokens = m * rows * columns
+    seen = scene_tokens + m * (SPECIALS + config.encoder.registers)
+    rays = (size[0] // config.renderer.patch) * (size[1] // config.renderer.patch)
+    tokens = tokens_per_slot(config) * slots
+    flops = {
+        "encode photos (VAE)": m * vae_encode(config.vae, 1, config.height, config.width),
+        "reconstruct": encoder(config.encoder, *size, m, config.renderer.width),
+        "query rays": renderer(config.renderer, *size, scene_tokens, m, m + n),
+        "condition": fusion(config, m + n, slots) + text(config.dit),
+        "velocity": velocity(config.dit, tokens),
+        "decode": vae_decode(config.vae, n, config.height, config.width),
+    }
+
+    def scores(queries: float, keys: float, heads: int) -> float:
+        return 0.0 if fused_attention else 8.0 * queries * keys * heads
+
+    e, r, d = config.encoder, config.renderer, config.dit
+    chunk = min(r.chunk, m + n)
+    ray_tokens = rays + r.registers
+    refined = r.attention != "cross" and (r.refinement == "per_view" or r.attention == "full")
+    features = 4.0 * (m + n) * rays * r.width
+    chunked = decoder_tensor_bytes(config) > SINGLE_PASS_BYTES
+    working = {
+        "encode photos (VAE)": 2 * decoder_tensor_bytes(config, m),
+        "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
+        "query rays": features
+        + chunk * scores(ray_tokens, scene_tokens, r.heads)
+        + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
+        "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
+        "velocity": features + scores(tokens, tokens, d.heads) + 4.0 * tokens * (6 * d.width + d.ffn),
+        "decode": 2 * decoder_tensor_bytes(config, 4 if chunked else n),
+    }
+    counts = {
+        "scene tokens": scene_tokens,
+        "ray tokens per view": ray_tokens,
+        "views": m + n,
+        "latent slots": slots,
+        "transformer tokens": tokens,
+    }
+    return Estimate(counts, flops, evaluations, weight_bytes(config, dtype), working)

@@ -1,0 +1,367 @@
+"""Make a video of a scene along a camera path: `python -m roge_jax.sample`, all options have defaults.
+
+    python -m roge_jax.sample                                      two real photos, an orbit, the shipped model
+    python -m roge_jax.sample --scene DIR --trajectory spiral --frames 49 --seed 1
+    python -m roge_jax.sample --scene DIR --context 0,7,12 --trajectory orbit:degrees=90,swing=false
+    python -m roge_jax.sample --scene DIR --trajectory path.json
+    python -m roge_jax.sample --checkpoint paper --context 6 --dry-run     shapes, FLOPs, memory; no weights needed
+
+OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., transforms.json (the frames with
+their cameras, in the scene's frame and unit), contact_sheet.png and run.json. docs/sampling.md explains everything.
+"""
+
+import argparse
+import contextlib
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .entry import Clock, environment, number, one_of, output_folder, run, write_json
+from .errors import UserError, did_you_mean
+
+DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
+DTYPES = ("auto", "float32", "bfloat16")
+LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
+
+
+def parser() -> argparse.ArgumentParser:
+    from .geometry.trajectories import PRESETS
+    from .sampling import LONG, SCHEDULE, SLOTS, SOLVER, STEPS
+    from .video.flow import SCHEDULES
+    from .video.solver_table import SOLVERS
+
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.sample", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--checkpoint", default="mini", help="model folder, or the name of a shipped one (default: mini)")
+    p.add_argument(
+        "--scene",
+        default="motorcycle",
+        help="scene folder, 'motorcycle' (two real photos, built in) or procedural:SEED (default: motorcycle)",
+    )
+    p.add_argument(
+        "--trajectory",
+        default="orbit",
+        metavar="NAME|FILE",
+        help="a path file (.json), or one of "
+        + ", ".join(sorted(PRESETS))
+        + "; options follow a colon, as in orbit:degrees=90,swing=false (default: orbit)",
+    )
+    p.add_argument("--frames", type=number(1), help="length of the path (default: one window of the model, or the file)")
+    p.add_argument("--steps", type=number(1), default=STEPS, help=f"sampling steps (default: {STEPS})")
+    p.add_argument("--solver", type=one_of(SOLVERS), default=SOLVER, help=f"{', '.join(SOLVERS)} (default: {SOLVER})")
+    p.add_argument(
+        "--schedule", type=one_of(SCHEDULES), default=SCHEDULE, help=f"{', '.join(SCHEDULES)} (default: {SCHEDULE})"
+    )
+    p.add_argument("--seed", type=number(0), default=0, help="seed of the noise; same seed, same frames (default: 0)")
+    p.add_argument("--out", type=Path, default=Path("outputs/sample"), help="folder (default: outputs/sample)")
+    p.add_argument(
+        "--context",
+        metavar="M|IDS",
+        help="how many photos, chosen to see as much as possible, or which: numbers from 0 or names, separated by\n"
+        f"commas ('4,' is photo 4 alone); the first is the world frame (default: up to {DEFAULT_CONTEXT})",
+    )
+    p.add_argument("--start", type=number(0), default=0, help="the context photo a preset path starts from (default: 0)")
+    p.add_argument("--fov", type=number(1e-3, whole=False), help="vertical field of view of the video in degrees")
+    p.add_argument("--size", help="HEIGHTxWIDTH of the video in pixels (default: the model's own)")
+    p.add_argument("--scale", type=number(1e-30, whole=False), help="divisor of all positions (default: the model's rule)")
+    p.add_argument(
+        "--context-slots",
+        type=one_of(SLOTS),
+        default="noised",
+        help="what the known latents are while sampling: noised to the current level, clean, or free (default: noised)",
+    )
+    p.add_argument(
+        "--long",
+        type=one_of(LONG),
+        default="chain",
+        help="paths longer than a window: chain (later windows see frames already made) or independent (default: chain)",
+    )
+    p.add_argument("--fps", type=number(1e-3, whole=False), default=16.0, help="frames per second (default: 16)")
+    p.add_argument("--dtype", type=one_of(DTYPES), default="auto", help="of large matrices: auto, float32, bfloat16")
+    p.add_argument("--dry-run", action="store_true", help="print shapes, tokens, FLOPs and memory, make nothing")
+    p.add_argument("--debug", action="store_true", help="show where in the program an error comes from")
+    return p
+
+
+# ---- what the options mean -----------------------------------------------------------------------
+
+
+def model_config(args: argparse.Namespace, *, weights: bool):
+    """The configuration of --checkpoint at --size; a preset without weights is enough for a dry run."""
+    from .checkpoint import find_model, load_config
+    from .config import PRESETS, preset
+
+    try:
+        config = load_config(find_model(args.checkpoint))
+    except UserError:
+        if weights or args.checkpoint not in PRESETS:
+            raise
+        config = preset(args.checkpoint)
+    if args.size is None:
+        return config
+    try:
+        height, width = (int(side) for side in args.size.lower().split("x"))
+    except ValueError:
+        raise UserError(f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}.") from None
+    patch = config.renderer.patch
+    ratio = config.recon_height / config.height, config.recon_width / config.width
+    return dataclasses.replace(
+        config,
+        height=height,
+        width=width,
+        recon_height=max(patch, round(height * ratio[0] / patch) * patch),
+        recon_width=max(patch, round(width * ratio[1] / patch) * patch),
+    )
+
+
+def context_ids(text: str | None, scene, most: int) -> list[int]:
+    """The views that --context asks for."""
+    from .data.scene import select_context
+
+    count = min(len(scene), most, DEFAULT_CONTEXT)
+    if text is not None and "," in text or text in scene.names:
+        return [_view(word.strip(), scene) for word in text.split(",") if word.strip()]
+    if text is not None:
+        if not text.isdigit() or not 1 <= int(text) <= min(len(scene), most):
+            raise UserError(
+                f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the model "
+                f"takes {most}), or photos by number or name, separated by commas."
+            )
+        count = int(text)
+    return select_context(scene, count)
+
+
+def _view(word: str, scene) -> int:
+    if word in scene.names:
+        return scene.names.index(word)
+    if word.isdigit() and int(word) < len(scene):
+        return int(word)
+    if word.isdigit():
+        raise UserError(f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0.")
+    raise UserError(f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}")
+
+
+def camera_path(args: argparse.Namespace, context, config):
+    """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video."""
+    from .geometry.cameras import Cameras
+    from .geometry.trajectories import PRESETS, load_path, make_path
+
+    name, _, words = args.trajectory.partition(":")
+    if Path(args.trajectory).suffix.lower() == ".json" or Path(args.trajectory).is_file():
+        size = {"height": config.height, "width": config.width}
+        path = load_path(args.trajectory, frames=args.frames, context=context, **size)
+    elif name not in PRESETS and ("/" in name or "." in name):
+        raise UserError(f"--trajectory {args.trajectory}: there is no such path file.")
+    else:
+        options = dict(_option(word, args.trajectory) for word in words.split(",") if word)
+        path = make_path(name, context, args.frames or config.frames, start=args.start, **options)
+    if args.fov is not None:
+        if not args.fov < 180:
+            raise UserError(f"--fov {args.fov:g}: the full vertical angle must lie between 0 and 180 degrees.")
+        focal = 0.5 * config.height / np.tan(np.radians(args.fov) / 2)
+        K = np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
+        path = Cameras(np.repeat(K[None], len(path), 0), path.c2w)
+    return path
+
+
+def _option(word: str, trajectory: str) -> tuple[str, Any]:
+    name, equals, value = word.partition("=")
+    if not equals:
+        raise UserError(f"--trajectory {trajectory}: '{word}' is no option: write NAME:OPTION=VALUE,OPTION=VALUE.")
+    try:
+        return name, json.loads(value.lower())
+    except json.JSONDecodeError:
+        return name, value
+
+
+def load_weights(args: argparse.Namespace):
+    """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+    import re
+
+    import jax
+    import jax.numpy as jnp
+
+    from . import checkpoint, model
+    from .core.params import count, flatten, unflatten
+    from .video.dit import FLOAT32_LEAVES
+
+    dtype = args.dtype
+    if dtype == "auto":
+        large = count(model.specs(checkpoint.load_config(checkpoint.find_model(args.checkpoint)))) > LARGE
+        dtype = "bfloat16" if large and jax.default_backend() != "cpu" else "float32"
+    params, config = checkpoint.load_model(args.checkpoint, dtype=jnp.dtype(dtype))
+    if dtype == "bfloat16":
+        flat = flatten(params)
+        params = unflatten(
+            {
+                path: leaf.astype(jnp.float32) if path.startswith("vae/") or re.search(FLOAT32_LEAVES, path) else leaf
+                for path, leaf in flat.items()
+            }
+        )
+    return params, config
+
+
+# ---- outputs -------------------------------------------------------------------------------------
+
+
+def transforms(names: list[str], cameras, height: int, width: int) -> dict[str, Any]:
+    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
+    from .geometry.cameras import opencv_to_opengl
+
+    frames = []
+    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
+        entry = {"file_path": f"frames/{name}", "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        frames.append(entry | {"transform_matrix": pose})
+    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
+
+
+def write_outputs(folder: Path, result, photos, fps: float) -> None:
+    """All files but run.json."""
+    from . import video_io
+
+    height, width = result.frames.shape[1:3]
+    names = video_io.write_frames(folder / "frames", result.frames)
+    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
+    video_io.write_video(folder / "video.mp4", result.frames, fps)
+    video_io.write_video(folder / "preview.mp4", result.preview, fps)
+    rows = {"photos": photos.images, "generated": result.frames, "preview (reconstruction)": result.preview}
+    video_io.write_png(folder / "contact_sheet.png", video_io.contact_sheet(rows))
+
+
+def record(args: argparse.Namespace, config, settings, scene, photos, result, clock: Clock) -> dict[str, Any]:
+    """run.json: everything needed to know what was made and to make it again."""
+    from .config import to_dict
+
+    info = result.normalisation
+    return {
+        "program": "roge_jax.sample",
+        **environment(),
+        "arguments": vars(args),
+        "settings": dataclasses.asdict(settings),
+        "scene": {
+            "source": scene.source,
+            "photos": len(scene),
+            "context": list(photos.ids),
+            "context_names": [scene.names[i] for i in photos.ids],
+        },
+        "scale": {
+            "divisor": info.divisor,
+            "status": info.status,
+            "rule": info.rule,
+            "context_reach": info.context_reach,
+            "target_reach": info.target_reach,
+        },
+        "frames": len(result.frames),
+        "size": list(result.frames.shape[1:3]),
+        "evaluations": result.evaluations,
+        "windows": list(result.windows),
+        "stages": clock.record(),
+        "config": to_dict(config),
+    }
+
+
+# ---- the program ---------------------------------------------------------------------------------
+
+
+def main(args: argparse.Namespace) -> None:
+    """Make the video and write OUT."""
+    import warnings
+
+    from . import sampling
+
+    settings = sampling.Settings(
+        steps=args.steps,
+        solver=args.solver,
+        schedule=args.schedule,
+        seed=args.seed,
+        slots=args.context_slots,
+        long=args.long,
+        scale=args.scale,
+    )
+    if args.dry_run:
+        return print(dry_run(args, settings))
+    from .data.scene import load_scene
+
+    clock = Clock()
+    config = model_config(args, weights=True)
+    with output_folder(args.out) as folder:
+        with clock("load"):
+            scene = load_scene(args.scene)
+            photos = sampling.read_photos(scene, context_ids(args.context, scene, config.max_context), config)
+            path = camera_path(args, photos.cameras, config)
+            params, _ = load_weights(args)
+        print(f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}")
+        result = sampling.sample(params, config, photos, path, settings, stage=clock, progress=True)
+        for note in result.normalisation.notes:
+            warnings.warn(note, stacklevel=2)
+        with clock("write"):
+            write_outputs(folder, result, photos, args.fps)
+        content = record(args, config, settings, scene, photos, result, clock)
+        write_json(folder / "run.json", content)
+    stages = ", ".join(f"{name} {stage['seconds']:.1f} s" for name, stage in content["stages"].items())
+    print(f"{stages}; peak memory {content['stages']['total'].get('peak_memory_gb', float('nan')):.2f} GB")
+    print(f"wrote {args.out}/ (video.mp4, preview.mp4, frames, transforms.json, contact_sheet.png, run.json)")
+
+
+def dry_run(args: argparse.Namespace, settings) -> str:
+    """Shapes, tokens, FLOPs and memory as text; weights are not read, photos are not decoded."""
+    import jax
+
+    from . import cost, sampling
+    from .data.scene import open_scene
+    from .video import solvers
+
+    config = model_config(args, weights=False)
+    if args.context is not None and args.context.isdigit():
+        m = int(args.context)
+        if not 1 <= m <= config.max_context:
+            raise UserError(f"--context {m}: this model ({config.name}) takes 1 to {config.max_context} photos.")
+    elif args.scene.startswith("procedural:"):
+        m = min(DEFAULT_CONTEXT, config.max_context)
+    else:
+        m = len(context_ids(args.context, open_scene(args.scene), config.max_context))
+    frames = args.frames or config.frames
+    runs = sampling.windows(frames, config.frames)
+    adaptive = solvers.SOLVERS[settings.solver].method is None
+    evaluations = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)
+    fast = jax.default_backend() != "cpu"
+    half = args.dtype == "bfloat16" or (args.dtype == "auto" and fast and sum(cost.weight_bytes(config).values()) > 4 * LARGE)
+    later = sum(sampling.chained(m, config)) if settings.long == "chain" else m
+    most = max(m, later) if len(runs) > 1 else m
+    first, last = (
+        cost.estimate(config, k, evaluations, dtype="bfloat16" if half else "float32", fused_attention=half and fast)
+        for k in (m, most)
+    )
+    total = first.total_flops + (len(runs) - 1) * last.total_flops
+    lines = [
+        f"model     {config.name}: {sum(cost.weight_bytes(config).values()) / 4e6:,.1f} M parameters, "
+        f"{sum(first.weights.values()) / 1e9:,.3f} GB as {'bfloat16' if half else 'float32'}",
+        f"video     {frames} frames of {config.height}x{config.width} (reconstruction at "
+        f"{config.recon_height}x{config.recon_width}), {len(runs)} windows of {config.frames}",
+        f"photos    {m}" + (f", then {most} with frames already made" if most != m else ""),
+        "tokens    " + ", ".join(f"{count:,} {name}" for name, count in first.tokens.items()),
+        f"latents   {config.slots(m)} x {config.latent_size[0]} x {config.latent_size[1]} x {config.vae.latent}",
+        f"solver    {settings.solver}, {settings.steps} steps: {evaluations} evaluations a window"
+        + (" (a guess: it chooses its own steps)" if adaptive else ""),
+        "",
+        f"{'stage (first window)':24s}{'TFLOP':>12s}{'working memory GB':>20s}",
+    ]
+    for name, flops in first.flops.items():
+        times = f" x {evaluations}" if name == "velocity" else ""
+        lines.append(f"{name + times:24s}{flops / 1e12:12.4f}{first.working_bytes[name] / 1e9:20.3f}")
+    lines += [
+        f"{'all windows':24s}{total / 1e12:12.4f}",
+        "",
+        f"peak memory about {last.peak_bytes / 1e9:,.2f} GB: weights and the largest stage, without the runtime's own",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    with contextlib.suppress(BrokenPipeError):
+        run(main, parser())
