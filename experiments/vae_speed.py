@@ -1,0 +1,284 @@
+"""Speed of the video VAE on one CPU core: this package against PyTorch (diffusers) with the same weights.
+
+    python experiments/vae_speed.py --core 3                      # writes experiments/results/vae_speed.json
+    nice -n 15 python experiments/vae_speed.py --core 3 --repeats 7
+
+Needs the extra `parity`. About ten minutes. For every case (width, clip) and operation (encode, decode, gradient of the
+reconstruction error with respect to all weights) it runs, in turn and in one process:
+  ours       three 2-D convolutions per causal 3x3x3 convolution, over the frames that exist
+  padded     the same after two zero frames (what those frames cost)
+  conv3d     one 3-D convolution of XLA
+  repeated   up-sampling by repetition and a 3x3 convolution (ours: four 2x2 convolutions of the small images)
+  torch      diffusers' AutoencoderKLWan, which works in chunks of one latent frame
+Times are CPU seconds of the process, pinned to one core with one thread each: unlike wall time they hardly depend on what
+else the machine does. Reported: median, lowest and highest of the repeats, ratio of medians to PyTorch's, compile time, and
+the largest relative L2 difference of any result, so that only equal computations are compared.
+
+The published system reports no such number. Our numbers: see the JSON file, which names processor and versions.
+"""
+
+import functools
+import json
+import os
+import platform
+import time
+from pathlib import Path
+from typing import NamedTuple
+from unittest import mock
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results" / "vae_speed.json"
+
+
+class Clip(NamedTuple):
+    name: str
+    base: int
+    frames: int
+    height: int
+    width: int
+
+
+CLIPS = (
+    Clip("mini image", 16, 1, 64, 112),
+    Clip("mini clip", 16, 17, 64, 112),
+    Clip("full-width image", 96, 1, 64, 112),
+    Clip("full-width clip", 96, 5, 64, 64),
+)
+
+
+def padded_conv(p, x, past, *, causal_conv):
+    """`causal_conv` with zero frames in place of missing history."""
+    import jax.numpy as jnp
+
+    history = jnp.zeros((2, *x.shape[1:]), x.dtype) if past is None else past
+    return causal_conv(p, x, history)
+
+
+def conv3d(p, x, past):
+    """One 3-D convolution in place of `vae.causal_conv`, for whole clips: it remembers nothing."""
+    import jax
+
+    assert past is None
+    y = jax.lax.conv_general_dilated(
+        x[None],
+        p["kernel"],
+        (1, 1, 1),
+        ((2, 0), (1, 1), (1, 1)),
+        dimension_numbers=("NDHWC", "DHWIO", "NDHWC"),
+    )
+    return y[0] + p["bias"].reshape(1, 1, 1, -1), None
+
+
+def repeated(x, kernel):
+    """Repetition and one convolution in place of `vae.up_conv`."""
+    import jax
+    import jax.numpy as jnp
+
+    t, h, w, c = x.shape
+    x = jnp.broadcast_to(x[:, :, None, :, None], (t, h, 2, w, 2, c)).reshape(t, 2 * h, 2 * w, c)
+    return jax.lax.conv_general_dilated(
+        x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+
+
+def random_params(cfg):
+    """Weights for which every layer matters, as JAX arrays."""
+    import jax.numpy as jnp
+
+    from roge_jax.core.params import flatten, unflatten
+    from roge_jax.video import vae
+
+    rng = np.random.default_rng(0)
+    params = {}
+    for path, spec in flatten(vae.vae_specs(cfg)).items():
+        x = rng.normal(size=spec.shape)
+        if len(spec.shape) > 1:
+            x /= np.sqrt(np.prod(spec.shape[:-1]))
+        else:
+            x = 0.1 * x + path.endswith("scale")
+        params[path] = jnp.asarray(x, jnp.float32)
+    return unflatten(params)
+
+
+def jax_operations(cfg, params, video, latents):
+    """{operation: (function without arguments, compile seconds)}; traces with the causal_conv in force now."""
+    import jax
+    import jax.numpy as jnp
+
+    from roge_jax.video import vae
+
+    def error(p, x):
+        z = vae.encode_moments(p, x, cfg=cfg)[..., : cfg.latent]
+        return jnp.square(jnp.clip(vae.decode_raw(p, z, cfg=cfg), -1, 1) - x).mean()
+
+    jobs = {
+        "encode": (functools.partial(vae.encode_moments, cfg=cfg), video),
+        "decode": (functools.partial(vae.decode_raw, cfg=cfg), latents),
+        "gradient": (jax.grad(error), video),
+    }
+    operations = {}
+    for name, (f, x) in jobs.items():
+        start = time.perf_counter()
+        compiled = jax.jit(f).lower(params, x).compile()
+        operations[name] = (
+            lambda compiled=compiled, x=x: jax.block_until_ready(compiled(params, x)),
+            time.perf_counter() - start,
+        )
+    return operations
+
+
+def torch_operations(cfg, params, video, latents):
+    import torch
+    from diffusers import AutoencoderKLWan
+
+    from roge_jax.weights import mapping, wan_vae
+
+    entries = wan_vae.mapping(cfg, "diffusers")
+    network = AutoencoderKLWan(base_dim=cfg.base).eval()
+    state = mapping.to_theirs(entries, params)
+    network.load_state_dict({key: torch.tensor(value) for key, value in state.items()})
+    x, z = (
+        torch.from_numpy(np.moveaxis(np.array(v), -1, 0)[None].copy()) for v in (video, latents)
+    )
+
+    def last(y):
+        return np.moveaxis(y.detach().numpy()[0], 0, -1)
+
+    def encode():
+        with torch.no_grad():
+            return last(network.encode(x).latent_dist.parameters)
+
+    def decode():
+        with torch.no_grad():
+            return last(network.decode(z).sample)
+
+    def gradient():
+        network.zero_grad(set_to_none=True)
+        y = network.decode(network.encode(x).latent_dist.mean).sample
+        torch.square(y - x).mean().backward()
+        return network
+
+    def gradient_tree(network):
+        """Gradients in our layout; weights that a single image never uses have none."""
+        grads = {
+            key: np.zeros(value.shape, np.float32) if value.grad is None else value.grad.numpy()
+            for key, value in network.named_parameters()
+        }
+        return mapping.to_ours(entries, grads)
+
+    return {"encode": encode, "decode": decode, "gradient": gradient}, gradient_tree
+
+
+def flat(result) -> np.ndarray:
+    import jax
+
+    return np.concatenate([np.asarray(x, np.float64).ravel() for x in jax.tree.leaves(result)])
+
+
+def difference(a, b) -> float:
+    a, b = flat(a), flat(b)
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+def measure(clip: Clip, repeats: int) -> list[dict]:
+    import jax
+
+    from roge_jax.config import VAEConfig
+    from roge_jax.video import vae
+
+    cfg = VAEConfig(base=clip.base)
+    params = random_params(cfg)
+    rng = np.random.default_rng(1)
+    shape = (clip.frames, clip.height, clip.width, 3)
+    slots = 1 + (clip.frames - 1) // 4
+    video = jax.numpy.asarray(rng.uniform(-1, 1, shape), jax.numpy.float32)
+    latents = rng.normal(size=(slots, clip.height // 8, clip.width // 8, 16))
+    latents = jax.numpy.asarray(latents, jax.numpy.float32)
+
+    compiled = {"ours": jax_operations(cfg, params, video, latents)}
+    padded = functools.partial(padded_conv, causal_conv=vae.causal_conv)
+    forms = {
+        "padded": ("causal_conv", padded),
+        "conv3d": ("causal_conv", conv3d),
+        "repeated": ("up_conv", repeated),
+    }
+    for name, (function, form) in forms.items():
+        with mock.patch.object(vae, function, form):
+            compiled[name] = jax_operations(cfg, params, video, latents)
+    theirs, gradient_tree = torch_operations(cfg, params, video, latents)
+
+    rows = []
+    for operation in ("encode", "decode", "gradient"):
+        runs = {name: table[operation][0] for name, table in compiled.items()}
+        runs["torch"] = theirs[operation]
+        results = {name: run() for name, run in runs.items()}  # warm
+        if operation == "gradient":
+            results["torch"] = gradient_tree(results["torch"])
+        if operation == "decode":  # diffusers clamps
+            results = {name: np.clip(np.asarray(y), -1, 1) for name, y in results.items()}
+        gaps = {name: difference(results[name], results["torch"]) for name in compiled}
+        del results
+        seconds = {name: [] for name in runs}
+        for i in range(repeats):
+            order = list(runs) if i % 2 == 0 else list(runs)[::-1]
+            for name in order:
+                start = time.process_time()
+                runs[name]()
+                seconds[name].append(time.process_time() - start)
+        reference = float(np.median(seconds["torch"]))
+        for name, values in seconds.items():
+            median = float(np.median(values))
+            row = {
+                "clip": clip._asdict(),
+                "operation": operation,
+                "form": name,
+                "cpu_s": {"median": median, "low": min(values), "high": max(values)},
+                "ratio_to_torch": median / reference,
+            }
+            if name in compiled:
+                row |= {"compile_s": compiled[name][operation][1], "rel_l2_to_torch": gaps[name]}
+            rows.append(row)
+            print(
+                f"{clip.name:18s} {operation:9s} {name:7s} {median:8.3f} s  "
+                f"[{min(values):.3f}, {max(values):.3f}]  {median / reference:5.2f} x torch",
+                flush=True,
+            )
+    return rows
+
+
+def processor() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def main(core: int = 0, repeats: int = 7, clips: tuple[str, ...] = (), out: Path = RESULTS) -> None:
+    """Measure `clips` (all by default), pinned to CPU `core`, and write `out`."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {core})  # before JAX sizes its thread pool
+    import diffusers
+    import jax
+    import torch
+
+    torch.set_num_threads(1)
+    rows = []
+    for clip in CLIPS:
+        if not clips or clip.name in clips:
+            rows += measure(clip, repeats)
+    report = {
+        "what": "Video VAE in float32, one core, CPU seconds; see experiments/vae_speed.py",
+        "processor": processor(),
+        "versions": {m.__name__: m.__version__ for m in (jax, torch, diffusers, np)},
+        "repeats": repeats,
+        "rows": rows,
+    }
+    out.parent.mkdir(parents=True, exist_ok=True)
+    out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    import tyro
+
+    tyro.cli(main)
