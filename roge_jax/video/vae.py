@@ -19,8 +19,8 @@ import numpy as np
 
 from ..config import VAEConfig
 from ..core.attention import attention
-from ..core.layers import lift, linear, linear_specs
-from ..core.params import Spec, Tree, fan_in, flatten, ones, unflatten, zeros
+from ..core.layers import lift, linear, linear_specs, norm_specs
+from ..core.params import Spec, Tree, fan_in, flatten, unflatten, zeros
 from ..errors import UserError
 
 SPACE, TIME = 8, 4  # compression
@@ -83,16 +83,12 @@ def rms_norm(p: Tree, x: jax.Array) -> jax.Array:
     return x * jax.lax.rsqrt(jnp.maximum(square, 1e-24)) * lift(gain, x.ndim)
 
 
-def _norm_specs(c: int) -> Tree:
-    return {"scale": Spec((c,), (None,), ones)}
-
-
 # ----------------------------------------------------------------------------------------------------------- blocks
 def res_specs(c_in: int, c_out: int) -> Tree:
     specs = {
-        "norm1": _norm_specs(c_in),
+        "norm1": norm_specs(c_in, bias=False),
         "conv1": conv_specs(c_in, c_out, (3, 3, 3)),
-        "norm2": _norm_specs(c_out),
+        "norm2": norm_specs(c_out, bias=False),
         "conv2": conv_specs(c_out, c_out, (3, 3, 3)),
     }
     if c_in != c_out:
@@ -111,7 +107,7 @@ def res_block(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
 
 def attn_specs(c: int) -> Tree:
     return {
-        "norm": _norm_specs(c),
+        "norm": norm_specs(c, bias=False),
         "qkv": linear_specs(c, 3 * c, (None, None)),
         "proj": linear_specs(c, c, (None, None)),
     }
@@ -213,7 +209,7 @@ def encoder_specs(cfg: VAEConfig) -> Tree:
             stage["down"] = down_specs(c, cfg.temporal[i])
         specs[f"stage{i}"] = stage
     c = widths[-1]
-    specs |= {"mid": mid_specs(c), "norm_out": _norm_specs(c)}
+    specs |= {"mid": mid_specs(c), "norm_out": norm_specs(c, bias=False)}
     return specs | {"conv_out": conv_specs(c, 2 * cfg.latent, (3, 3, 3))}
 
 
@@ -238,7 +234,7 @@ def decoder_specs(cfg: VAEConfig) -> Tree:
         if i < len(temporal):
             stage["up"] = up_specs(c, temporal[i])
         specs[f"stage{i}"] = stage
-    specs["norm_out"] = _norm_specs(widths[-1])
+    specs["norm_out"] = norm_specs(widths[-1], bias=False)
     return specs | {"conv_out": conv_specs(widths[-1], 3, (3, 3, 3))}
 
 
