@@ -58,6 +58,7 @@ def execute(
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
     with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)  # sentences for the user
         warnings.showwarning = _one_line
         try:
             args = parse(parser, arguments)
@@ -141,8 +142,7 @@ def _report(error: BaseException, code: int, debug: bool) -> int:
 
 
 def _one_line(message, category, filename, lineno, file=None, line=None) -> None:
-    if issubclass(category, UserWarning):
-        print(f"warning: {message}", file=sys.stderr)
+    print(f"warning: {message}", file=sys.stderr)
 
 
 # ---- compiled programs are kept ------------------------------------------------------------------

@@ -177,7 +177,6 @@ def window_views(
 class Programs(NamedTuple):
     """What runs in a window of given shapes, compiled."""
 
-    noise: Callable  # (seed, window) -> [t, lh, lw, 16]
     prepare: Callable  # (params, views) -> Prepared
     velocity: Callable  # (params, prepared, noise, x, sigma) -> velocity
     decode: Callable  # (params, x0) -> frames [n, h, w, 3]
@@ -199,9 +198,13 @@ def decode(params, x0, *, config: RoGeConfig, contexts: int):
     return jnp.clip(0.5 + 0.5 * video, 0.0, 1.0)
 
 
-def draw(seed, window, *, config: RoGeConfig, contexts: int):
-    """The noise of a window: a function of seed and window alone."""
-    return model.draw_noise(jax.random.fold_in(jax.random.key(seed), window), contexts, config=config)
+def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
+    """The noise of a window [t, lh, lw, 16] from seed and number alone, the same on every device.
+
+    NumPy, because compiling JAX's generator takes longer than a short video's sampling.
+    """
+    shape = (config.slots(contexts), *config.latent_size, config.vae.latent)
+    return np.random.default_rng([seed, window]).standard_normal(shape, np.float32)
 
 
 def programs(params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots) -> Programs:
@@ -209,7 +212,6 @@ def programs(params: Tree, views: model.Views, config: RoGeConfig, slots: model.
     m = views["context_rgb"].shape[0]
     fix = functools.partial
     pieces = {
-        "noise": jax.jit(fix(draw, config=config, contexts=m)),
         "prepare": jax.jit(fix(model.prepare, config=config)),
         "velocity": jax.jit(fix(velocity, config=config, slots=slots)),
         "decode": jax.jit(fix(decode, config=config, contexts=m)),
@@ -219,16 +221,15 @@ def programs(params: Tree, views: model.Views, config: RoGeConfig, slots: model.
     def shapes(tree):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
 
-    weights, seen, whole = shapes(params), shapes(views), jax.ShapeDtypeStruct((), jnp.int32)
+    weights, seen = shapes(params), shapes(views)
     prepared = jax.eval_shape(pieces["prepare"], weights, seen)
-    state = jax.eval_shape(pieces["noise"], whole, whole)
+    state = shapes(draw_noise(0, 0, m, config))
     sigma = jax.ShapeDtypeStruct((), jnp.float32)
     arguments = {
         "prepare": (weights, seen),
         "velocity": (weights, prepared, state, state, sigma),
         "decode": (weights, state),
         "preview": (weights, prepared.features),
-        "noise": (whole, whole),
     }
     # Tracing holds Python's lock, compiling does not.
     lowered = {name: pieces[name].lower(*shape) for name, shape in arguments.items()}
@@ -286,7 +287,7 @@ def sample(
         run = cache[m]
         with stage("prepare"):
             prepared = jax.block_until_ready(run.prepare(params, views))
-            noise = run.noise(np.int32(settings.seed), np.int32(number))
+            noise = jnp.asarray(draw_noise(settings.seed, number, m, config))
         with stage("sample"):
             x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
         with stage("decode"):
