@@ -2,10 +2,8 @@
 
 import inspect
 import json
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -365,19 +363,12 @@ def test_check_compares_poses_with_photos():
     assert [f.severity for f in findings] == ["warning"]
 
 
-DEVELOPER = os.environ.get("ROGE_DEV_DATA")
-developer = pytest.mark.skipif(
-    DEVELOPER is None, reason="needs ROGE_DEV_DATA, a folder with scenes/fox ..."
-)
-
-
-@developer
 @pytest.mark.parametrize(
     ("name", "pixels"), [("fox", 0.3), ("banana", 0.2), ("brighton", 0.2), ("hololens", 1.2)]
 )
-def test_real_scenes(name, pixels):
+def test_real_scenes(dev_data, name, pixels):
     """Published poses fit the photos to sub-pixel distances; with OpenCV axes they do not."""
-    folder = Path(DEVELOPER) / "scenes" / name
+    folder = dev_data / "scenes" / name
     report = check(Config(str(folder)))
     assert report.usable and report.numbers["epipolar_pixels"] < pixels
     assert report.numbers["axes_meet_in_front"] > 2 * report.numbers["axes_meet_behind"]
