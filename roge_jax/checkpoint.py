@@ -15,10 +15,11 @@ import numpy as np
 
 from . import model
 from .config import PRESETS, RoGeConfig, from_dict, to_dict
-from .core.params import Tree, check, flatten, unflatten
+from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
 
 SHARD_BYTES = 15_000_000
+ADAPTER = "adapter.safetensors"
 ASSETS = Path(__file__).with_name("assets")
 WEIGHTS_VARIABLE = "ROGE_WEIGHTS"  # a folder with further models, looked up by name
 
@@ -115,12 +116,17 @@ def find_model(name: str | Path) -> Path:
 
 
 def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig]:
-    """(params, config) of a model folder or shipped model, floating leaves in `dtype`, checked against the config."""
+    """(params, config) of a model folder or shipped model, checked against the config.
+
+    Floating leaves come in `dtype`; None: as they are stored.
+    """
     from safetensors import SafetensorError
     from safetensors.flax import load_file
 
     folder = find_model(name)
     config = load_config(folder)
+    if (folder / ADAPTER).exists():
+        raise UserError(f"{folder} is an adapter: `python -m roge_jax.export {folder} --merge BASE` makes a model of it.")
     files = sorted(folder.glob("model-*.safetensors"))
     expected = int(files[0].stem.rsplit("-", 1)[1]) if files else 1
     if len(files) != expected:
@@ -134,11 +140,86 @@ def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig
             flat |= load_file(file)
         except SafetensorError as error:
             raise UserError(f"{file} is truncated or not a safetensors file ({error}): copy it again.") from error
-    params = unflatten(
-        {k: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v for k, v in flat.items()}
-    )
+    if dtype is not None:
+        flat = {k: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v for k, v in flat.items()}
+    params = unflatten(flat)
     check(params, model.specs(config), source=str(folder))
     return params, config
+
+
+def save_adapter(folder: Path, tree: Tree, config: RoGeConfig, provenance: dict | None = None) -> None:
+    """Write what training on top of a model changed: LoRA factors and the leaves that trained fully, in float32.
+
+    `tree` is the sparse tree that trained. The folder gets `adapter.safetensors`, `config.json` and a model card,
+    README.md, made of `provenance` (`weights.model_card` says which entries it reads). An adapter there is replaced.
+    """
+    from safetensors.flax import save_file
+
+    from .weights.model_card import adapter_card
+
+    folder = Path(folder)
+    temporary = folder.with_name(folder.name + ".part")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir(parents=True)
+    leaves = {path: jnp.asarray(x, jnp.float32) for path, x in flatten(jax.device_get(tree)).items()}
+    check_adapter(unflatten(leaves), config, source="the adapter")
+    save_file(leaves, temporary / ADAPTER)
+    record = {"format": 1, "kind": "adapter", "config": to_dict(config), "provenance": provenance or {}}
+    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
+    (temporary / "README.md").write_text(adapter_card(leaves, config, provenance or {}))
+    old = folder.with_name(folder.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    temporary.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load_adapter(folder: str | Path) -> tuple[Tree, RoGeConfig]:
+    """(sparse tree, config) of an adapter folder. `core.lora.attach(params, tree)` applies it to its base."""
+    from safetensors import SafetensorError
+    from safetensors.flax import load_file
+
+    folder = Path(folder)
+    if not (folder / ADAPTER).exists():
+        raise UserError(f"{folder} holds no {ADAPTER}: give a folder that training wrote as `adapter`.")
+    config = load_config(folder)
+    try:
+        tree = unflatten(load_file(folder / ADAPTER))
+    except SafetensorError as error:
+        raise UserError(f"{folder / ADAPTER} is truncated or damaged ({error}): copy it again.") from error
+    check_adapter(tree, config, source=str(folder / ADAPTER))
+    return tree, config
+
+
+def check_adapter(tree: Tree, config: RoGeConfig, *, source: str) -> None:
+    """Raise one UserError that lists every leaf of a sparse tree that does not belong to the model or does not fit."""
+    want = flatten(model.specs(config))
+    have = {path: tuple(x.shape) for path, x in flatten(tree).items()}
+    faults = []
+    for path, shape in have.items():
+        layer, _, leaf = path.rpartition("/")
+        if leaf in ("lora_a", "lora_b"):
+            kernel = want.get(f"{layer}/kernel")
+            other = have.get(f"{layer}/{'lora_b' if leaf == 'lora_a' else 'lora_a'}")
+            if kernel is None or other is None or not _factor_fits(leaf, shape, other, kernel):
+                faults.append(f"{path} {shape}")
+        elif path not in want or shape != want[path].shape:
+            faults.append(f"{path} {shape}")
+    if faults or not have:
+        more = f"; and {len(faults) - 20} more" if len(faults) > 20 else ""
+        raise UserError(
+            f"{source} does not fit preset '{config.name}' ({len(faults)} mismatches): "
+            f"{'; '.join(faults[:20]) or 'it is empty'}{more}. Use it with the model it was trained on."
+        )
+
+
+def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
+    lead = 1 if kernel.axes[0] == "layers" else 0
+    *ins, d_out = kernel.shape[lead:]
+    a, b = (shape, other) if leaf == "lora_a" else (other, shape)
+    head, rank = kernel.shape[:lead], a[-1]
+    return a == (*head, int(np.prod(ins)), rank) and b == (*head, rank, d_out)
 
 
 def load_config(folder: Path) -> RoGeConfig:

@@ -1,0 +1,267 @@
+"""Convert published weights: `python -m roge_jax.convert --wan DIR --lagernvs FILE --out DIR`.
+
+    --wan Wan2.1-I2V-14B-480P --lagernvs model.pt --prompt-embedding empty.safetensors --out weights/paper
+    --wan Wan2.1-T2V-1.3B --lagernvs model.pt --t5 umt5-xxl --out weights/wan1.3b
+    ... --dry-run                reads headers alone and prints what would fill what
+
+Every tensor of every file is used once and every leaf filled once, or all that does not fit is listed in one error.
+Memory stays at a few of the largest tensors. docs/weights.md says where the files come from and under which licence.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+from .entry import one_of
+
+NETWORKS = ("encoder", "renderer", "vae", "dit")
+CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mask 4, condition 16
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.convert", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    p.add_argument("--wan", type=Path, help="Wan2.1 transformer: official or diffusers folder, or its file")
+    p.add_argument("--wan-vae", type=Path, help="Wan2.1_VAE.pth or diffusers' vae (default: beside --wan)")
+    p.add_argument("--lagernvs", type=Path, help="LagerNVS checkpoint, model.pt: encoder and renderer")
+    p.add_argument("--vggt", type=Path, help="VGGT-1B, where LagerNVS is not at hand: the aggregator alone")
+    p.add_argument("--framecrafter", type=Path, help="FrameCrafter checkpoint, merged into --wan")
+    p.add_argument(
+        "--preset",
+        help="paper, wan1.3b, ..., or a model folder whose config is taken\n(default: the sizes found in the files)",
+    )
+    p.add_argument("--prompt-embedding", type=Path, help="umT5 rows [rows, 4096] as .npy or .safetensors")
+    p.add_argument("--t5", type=Path, help="umT5 encoder and tokenizer (Hugging Face folder) to compute them with")
+    p.add_argument("--prompt", default="", help="the prompt for --t5 (default: the empty prompt)")
+    p.add_argument(
+        "--random",
+        nargs="+",
+        default=[],
+        metavar="NETWORK",
+        type=one_of(NETWORKS),
+        help="networks to initialise randomly instead: encoder renderer vae dit",
+    )
+    p.add_argument("--seed", type=int, default=0, help="of everything that is initialised (default: 0)")
+    p.add_argument("--out", type=Path, help="new model folder")
+    p.add_argument(
+        "--dtype",
+        default="bfloat16",
+        type=one_of(("bfloat16", "float32")),
+        help="of the large frozen matrices (default: bfloat16); all else is float32",
+    )
+    p.add_argument("--shard-gb", type=float, default=4.0, help="largest size of one file in GB (default: 4)")
+    p.add_argument("--dry-run", action="store_true", help="print what would be done, from headers alone")
+    p.add_argument("--resume", action="store_true", help="continue a conversion that was cut off")
+    p.add_argument("--debug", action="store_true", help="show tracebacks")
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
+    from .errors import UserError
+    from .weights import importer
+
+    if args.out is None and not args.dry_run:
+        raise UserError("No --out given: name the model folder to write, or ask for a --dry-run.")
+    if not args.shard_gb > 0:
+        raise UserError(f"--shard-gb {args.shard_gb} is no size: give a positive number of GB.")
+    if args.out is not None:
+        importer.check_output(args.out)
+    plan, filled = make_plan(args)
+    layout = plan.layout(1e9 * args.shard_gb)
+    print(summary(plan, filled, layout))
+    if args.out is not None:
+        importer.check_disk(args.out.with_name(args.out.name + ".part"), sum(layout.sizes))
+    if args.dry_run:
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=sum(layout.sizes), unit="B", unit_scale=True, disable=not sys.stderr.isatty()) as bar:
+
+        def progress(done: int, _total: int) -> None:
+            bar.update(done - bar.n)
+
+        try:
+            importer.write(
+                plan, args.out, resume=args.resume, shard_bytes=1e9 * args.shard_gb, progress=progress
+            )
+        except KeyboardInterrupt:
+            print(f"{args.out}.part is kept: the same command with --resume continues it.", file=sys.stderr)
+            raise
+    print(f"{args.out}: written")
+
+
+def make_plan(args: argparse.Namespace):
+    """(plan, what each file does), from headers alone but for the prompt. Raises: UserError with all mismatches."""
+    from .core.params import flatten
+    from .errors import UserError
+    from .model import specs
+    from .weights import importer, published
+    from .weights.prompt import encode_prompt, read_prompt
+    from .weights.sources import open_source
+
+    filled: list[Any] = []
+    wan = vae_path = recon = framecrafter = None
+    role = "--lagernvs" if args.lagernvs else "--vggt"
+    if args.framecrafter and not args.wan:
+        raise UserError("--framecrafter holds changes to a Wan2.1 transformer: give that one with --wan.")
+    if args.wan:
+        wan, vae_path = published.find_wan(args.wan)
+    if args.lagernvs or args.vggt:
+        recon = open_source(args.lagernvs or args.vggt)
+        kind = ("lagernvs", "a LagerNVS checkpoint") if args.lagernvs else ("vggt", "VGGT-1B")
+        published.expect(recon, kind[:1], role, kind[1])
+    if args.lagernvs and args.vggt:
+        unused = open_source(args.vggt)
+        published.expect(unused, ("vggt",), "--vggt", "VGGT-1B")
+        note = "not needed: LagerNVS brings its own, further trained aggregator"
+        filled.append(published.Filled("--vggt", unused, "official", [], [], (note,)))
+    if args.framecrafter:
+        framecrafter = open_source(args.framecrafter)
+        published.expect(framecrafter, ("lora",), "--framecrafter", "FrameCrafter's LoRA file")
+    vae = open_source(args.wan_vae or vae_path) if (args.wan_vae or vae_path) else None
+
+    config = choose_config(args.preset, wan, recon)
+    _require(args, config, wan, vae, recon)
+    if wan is not None:
+        filled += published.fill_dit(config.dit, wan, framecrafter)
+    if vae is not None:
+        filled.append(published.fill_vae(config.vae, vae, "--wan-vae"))
+    if recon is not None:
+        filled.append(published.fill_recon(config, recon, role))
+    importer.report(fault for part in filled for fault in part.faults)
+
+    given = {}
+    if config.dit.text_len and args.prompt_embedding:
+        given["prompt/rows"] = read_prompt(args.prompt_embedding, config.dit)
+    elif config.dit.text_len and args.t5 and not args.dry_run:
+        given["prompt/rows"] = encode_prompt(args.t5, args.prompt, config.dit)
+    elif args.prompt_embedding or (args.t5 and not config.dit.text_len):
+        raise UserError(f"Preset '{config.name}' reads no text: leave --prompt-embedding and --t5 away.")
+    fills = [fill for part in filled for fill in part.fills]
+    tree = flatten(specs(config))
+    importer.check_coverage(fills, tree)
+    plan = importer.Plan(config, tree, fills, given, args.dtype == "bfloat16", {}, args.seed)
+    provenance = {
+        "converted": [
+            {
+                "option": part.role,
+                "files": [{"name": f.name, "bytes": f.stat().st_size} for f in part.source.files],
+                "names": part.layout,
+                "tensors": len(part.fills),
+                "notes": list(part.notes),
+            }
+            for part in filled
+        ],
+        "prompt": _prompt_note(args),
+        "initialised": plan.initialised,
+        "seed": args.seed,
+    }
+    return plan._replace(provenance=provenance), filled
+
+
+def choose_config(name: str | None, wan, recon):
+    """The configuration: a preset, that of a model folder, or the sizes found in the files."""
+    from . import checkpoint, config
+    from .errors import UserError
+    from .weights import published
+
+    if name in config.PRESETS:
+        chosen = config.preset(name)
+    elif name is not None and Path(name).is_dir():
+        chosen = checkpoint.load_config(Path(name))
+    elif name is not None:
+        chosen = config.preset(name)  # raises, with the closest name
+    else:
+        chosen = None
+    found = published.dit_config(wan) if wan is not None else None
+    if chosen is not None:
+        if found is not None and (found.width, found.depth) != (chosen.dit.width, chosen.dit.depth):
+            fits = [p for p in config.PRESETS if _same_size(config.preset(p).dit, found)]
+            raise UserError(
+                f"{wan.path} holds a transformer of width {found.width} with {found.depth} blocks, and preset "
+                f"'{chosen.name}' has {chosen.dit.width} and {chosen.dit.depth}: "
+                f"use {'--preset ' + fits[0] if fits else 'no --preset to take the sizes of the file'}."
+            )
+        return chosen
+    chosen = config.RoGeConfig()
+    if found is not None:
+        dit = dataclasses.replace(found, in_channels=CONDITIONED)
+        same = [p for p in config.PRESETS if config.preset(p).dit == dit]
+        chosen = config.preset(same[0]) if same else dataclasses.replace(chosen, name="custom", dit=dit)
+    if recon is not None:
+        encoder, renderer = published.recon_config(recon)
+        found_recon = {"encoder": encoder} | ({"renderer": renderer} if renderer else {})
+        if any(getattr(chosen, part) != cfg for part, cfg in found_recon.items()):
+            chosen = dataclasses.replace(chosen, name="custom", **found_recon)
+    return chosen
+
+
+def _same_size(a, b) -> bool:
+    return (a.width, a.depth) == (b.width, b.depth)
+
+
+def _require(args, config, wan, vae, recon) -> None:
+    """Every network has a file or is declared random."""
+    from .errors import UserError
+
+    options = {"dit": "--wan", "vae": "--wan-vae", "encoder": "--lagernvs", "renderer": "--lagernvs"}
+    have = {"dit": wan, "vae": vae, "encoder": recon, "renderer": recon}
+    lost = [name for name in NETWORKS if have[name] is None and name not in args.random]
+    both = [name for name in args.random if have[name] is not None]
+    if both:
+        raise UserError(f"--random {both[0]}, but a file fills it as well: leave one of the two away.")
+    if lost:
+        wanted = " and ".join(dict.fromkeys(options[name] for name in lost))
+        raise UserError(
+            f"Nothing fills {', '.join(lost)}: give {wanted}, or --random {' '.join(lost)} to initialise them."
+        )
+
+
+def _prompt_note(args) -> str:
+    if args.prompt_embedding:
+        return f"read from {args.prompt_embedding.name}"
+    return f"umT5 of '{args.prompt}'" if args.t5 else "none: all rows are zero"
+
+
+def summary(plan, filled, layout) -> str:
+    """What fills what, as text for people."""
+    from .core.params import count
+
+    lines = []
+    for part in filled:
+        files = part.source.files
+        shards = f" in {len(files)} files" if len(files) > 1 else ""
+        lines.append(
+            f"{part.role} {part.source.path}: {part.layout} names, {len(part.source.tensors)} tensors, "
+            f"{part.source.nbytes / 1e9:.2f} GB{shards}"
+        )
+        lines += [f"    {note}" for note in part.notes]
+    lines.append(f"{'network':10}{'leaves':>8}{'tensors':>9}{'parameters':>16}{'GB':>8}{'initialised':>13}")
+    initial = set(plan.initialised)
+    for network in dict.fromkeys(path.partition("/")[0] for path in plan.specs):
+        specs = {path: s for path, s in plan.specs.items() if path.startswith(f"{network}/")}
+        tensors = sum(fill.path in specs for fill in plan.fills)
+        size = sum(count({p: s}) * plan.dtype(p).itemsize for p, s in specs.items())
+        lines.append(
+            f"{network:10}{len(specs):8}{tensors:9}{count(specs):16,}{size / 1e9:8.2f}{len(initial & set(specs)):13}"
+        )
+    lines.append(
+        f"preset {plan.config.name}, {sum(layout.sizes) / 1e9:.2f} GB in {len(layout.sizes)} files, "
+        f"large matrices in {'bfloat16' if plan.half else 'float32'}"
+    )
+    if initial:
+        shown = [p for p in plan.initialised if not p.startswith(("vae/", "dit/", "renderer/"))]
+        whole = [n for n in ("vae", "dit", "renderer") if any(p.startswith(f"{n}/") for p in initial)]
+        lines.append(f"not in the files, initialised: {', '.join(whole + shown)}")
+    if "prompt/rows" in initial:
+        lines.append("no prompt embedding: its rows are zero; the published transformers expect --t5 or --prompt-embedding")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    from .entry import run
+
+    run(main, parser())

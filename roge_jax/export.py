@@ -1,0 +1,162 @@
+"""Export a trained adapter: `python -m roge_jax.export ADAPTER --merge BASE --out DIR` (or `--style`).
+
+    --merge BASE             a standalone model folder: the base with the LoRA merged and the new embeddings in place
+    --style diffusers        the transformer's LoRA alone, under the names of diffusers' load_lora_adapter
+    --style peft             ... with an adapter_config.json for peft around a diffusers transformer
+    --style framecrafter     ... for FrameCrafter and DiffSynth-Studio
+    --style comfyui          ... for ComfyUI
+
+Training writes ADAPTER. Merging streams: memory stays at a few layers of the model.
+"""
+
+import argparse
+import functools
+import json
+from pathlib import Path
+
+from .entry import one_of
+
+STYLES = ("diffusers", "peft", "framecrafter", "comfyui")
+FILES = {
+    "diffusers": "pytorch_lora_weights.safetensors",
+    "peft": "adapter_model.safetensors",
+    "framecrafter": "lora.safetensors",
+    "comfyui": "lora.safetensors",
+}
+
+
+def parser() -> argparse.ArgumentParser:
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.export", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    p.add_argument("adapter", type=Path, help="adapter folder written by training")
+    p.add_argument("--merge", metavar="BASE", help="model folder or name to merge it into")
+    p.add_argument("--style", type=one_of(STYLES), help="names for other programs (the transformer's LoRA alone)")
+    p.add_argument("--out", type=Path, required=True, help="new folder")
+    p.add_argument("--shard-gb", type=float, default=4.0, help="with --merge: largest size of one file in GB")
+    p.add_argument("--debug", action="store_true", help="show tracebacks")
+    return p
+
+
+def main(args: argparse.Namespace) -> None:
+    from .checkpoint import load_adapter
+    from .errors import UserError
+    from .weights.importer import check_output
+
+    if bool(args.merge) == bool(args.style):
+        raise UserError("Give either --merge BASE for a whole model, or --style for other programs' LoRA files.")
+    check_output(args.out)
+    tree, config = load_adapter(args.adapter)
+    if args.merge:
+        merge_into(args.merge, tree, config, args.adapter, args.out, shard_bytes=1e9 * args.shard_gb)
+    else:
+        write_lora(tree, config, args.style, args.out)
+    print(f"{args.out}: written")
+
+
+def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes: float) -> None:
+    """Write the base with the adapter in it as a model folder, layer by layer.
+
+    Kernels get a @ b in float32 and are rounded once to the base's dtype. Raises: UserError if the base has other
+    networks than the adapter was trained on.
+    """
+    import numpy as np
+
+    from . import checkpoint, model
+    from .core.params import flatten
+    from .errors import UserError
+    from .weights import importer
+    from .weights.sources import DTYPES, open_source
+
+    folder = checkpoint.find_model(base)
+    if (folder / checkpoint.ADAPTER).exists():
+        raise UserError(f"--merge {base} is an adapter itself: give the model that it was trained on.")
+    base_config = checkpoint.load_config(folder)
+    for part in ("encoder", "renderer", "vae", "dit", "fusion"):
+        if not _same_shapes(part, base_config, config):
+            raise UserError(
+                f"{adapter} was trained on another '{part}' than {folder} has (presets '{config.name}' and "
+                f"'{base_config.name}'): merge it into its own base."
+            )
+    source, specs = open_source(folder), flatten(model.specs(config))
+    lost = [path for path in specs if path not in source.tensors]
+    if lost:
+        raise UserError(f"{folder} is incomplete: {lost[0]} and {len(lost) - 1} more leaves are missing.")
+    changed = flatten(tree)
+    fills = []
+    for path, spec in specs.items():
+        layer = path.rpartition("/")[0]
+        if path in changed:
+            continue
+        factors = None
+        if path.endswith("/kernel") and f"{layer}/lora_a" in changed:
+            factors = tuple(np.asarray(changed[f"{layer}/lora_{side}"]) for side in "ab")
+        for i in range(spec.shape[0]) if spec.axes[0] == "layers" else (None,):
+            fills.append(importer.Fill(path, i, source, path, functools.partial(_merged, factors, i)))
+    given = {p: np.asarray(x) for p, x in changed.items() if not p.endswith(("lora_a", "lora_b"))}
+    record = json.loads((folder / "config.json").read_text()).get("provenance", {})
+    trained = json.loads((adapter / "config.json").read_text()).get("provenance", {})
+    half = any(t.dtype == DTYPES["BF16"] for t in source.tensors.values())
+    provenance = {"merged": trained, "base": record}
+    plan = importer.Plan(config, specs, fills, given, half, provenance)
+    importer.check_coverage(fills, specs)
+    importer.write(plan, out, shard_bytes=shard_bytes)
+
+
+def _merged(factors, layer, kernel):
+    import numpy as np
+
+    kernel = kernel if layer is None else kernel[layer]
+    if factors is None:
+        return kernel
+    a, b = factors if layer is None else (factors[0][layer], factors[1][layer])
+    total = np.matmul(a, b, dtype=np.float32).reshape(kernel.shape)
+    total += kernel
+    return total
+
+
+def _same_shapes(part: str, a, b) -> bool:
+    from . import model
+    from .core.params import abstract, flatten
+
+    shapes = [
+        {p: s.shape for p, s in flatten(abstract(model.specs(config)[part])).items()} for config in (a, b)
+    ]
+    return shapes[0] == shapes[1]
+
+
+def write_lora(tree, config, style: str, out: Path) -> None:
+    """The transformer's LoRA under the names of `style` in a folder of its own."""
+    import numpy as np
+    from safetensors.numpy import save_file
+
+    from .core.params import flatten, unflatten
+    from .errors import UserError
+    from .weights.importer import check_output
+    from .weights.lora_export import export_lora
+
+    flat = {p: np.asarray(x) for p, x in flatten(tree.get("dit", {})).items() if p.endswith(("lora_a", "lora_b"))}
+    if not flat:
+        raise UserError("The adapter holds no LoRA of the transformer: only --merge can export it.")
+    tensors = export_lora(unflatten(flat), style=style)
+    part = check_output(out)
+    part.mkdir(parents=True, exist_ok=True)
+    save_file(tensors, part / FILES[style], metadata={"format": "pt"})
+    rank = next(x.shape[-1] for p, x in flat.items() if p.endswith("lora_a"))
+    if style == "peft":
+        names = sorted({k.partition(".lora_")[0].removeprefix("base_model.model.") for k in tensors})
+        adapter = {"peft_type": "LORA", "r": rank, "lora_alpha": rank, "target_modules": names, "bias": "none"}
+        (part / "adapter_config.json").write_text(json.dumps(adapter, indent=1) + "\n")
+    part.rename(out)
+    left = sorted({p.partition("/")[0] for p in flatten(tree)} - {"dit"})
+    full = any(p.startswith("dit/patch_embed") for p in flatten(tree))
+    print(
+        f"{len(tensors)} factors of rank {rank}. Not in this file, for other programs have no place for it: "
+        f"{', '.join(left + ['the retrained first embedding'] * full) or 'nothing'}."
+    )
+
+
+if __name__ == "__main__":
+    from .entry import run
+
+    run(main, parser())

@@ -1,0 +1,82 @@
+"""The README.md of an adapter: what it is, how to use it, what it was made from and under which licences.
+
+Entries of `provenance` that are read, all optional: `base` (name of the model it was trained on),
+`base_provenance` (that model's own provenance, as `roge_jax.convert` wrote it), `stage`, `steps`, `data` (one sentence
+on the training data) and `data_license`.
+"""
+
+from collections.abc import Mapping
+
+from ..config import RoGeConfig
+
+# By the option of roge_jax.convert that read the file: (what it is, licence, where its text is).
+LICENCES = {
+    "--lagernvs": (
+        "LagerNVS",
+        "FAIR Noncommercial Research License: research only, no commercial use",
+        "https://huggingface.co/facebook/lagernvs_general_512",
+    ),
+    "--vggt": ("VGGT-1B", "the VGGT license", "https://huggingface.co/facebook/VGGT-1B"),
+    "--wan": ("Wan2.1", "Apache-2.0", "https://huggingface.co/Wan-AI"),
+    "--wan-vae": ("Wan2.1 VAE", "Apache-2.0", "https://huggingface.co/Wan-AI"),
+    "--framecrafter": ("FrameCrafter", "see its repository", "its repository"),
+}
+
+
+def adapter_card(leaves: Mapping[str, object], config: RoGeConfig, provenance: Mapping) -> str:
+    """The text of the card; `leaves` are the adapter's arrays by path."""
+    factors = {p: x for p, x in leaves.items() if p.endswith("lora_a")}
+    full = [p for p in leaves if not p.endswith(("lora_a", "lora_b"))]
+    ranks: dict[str, set[int]] = {}
+    for path, x in factors.items():
+        ranks.setdefault(path.partition("/")[0], set()).add(x.shape[-1])  # type: ignore[attr-defined]
+    base = provenance.get("base", "not recorded")
+    sources = _sources(provenance)
+    restricted = any("Noncommercial" in text or "VGGT license" in text for text in sources)
+    count = sum(x.size for x in leaves.values())  # type: ignore[attr-defined]
+    lines = [
+        "---",
+        f"license: {'other' if restricted else 'apache-2.0'}",
+        "library_name: roge_jax",
+        "tags: [novel-view-synthesis, lora, jax]",
+        "---",
+        f"# RoGe adapter for `{config.name}`",
+        "",
+        f"LoRA factors and new embeddings, {count:,} parameters in float32, trained on top of `{base}`.",
+        "",
+        "| part | contents |",
+        "|---|---|",
+    ]
+    for network, found in sorted(ranks.items()):
+        layers = sum(path.startswith(f"{network}/") for path in factors)
+        lines.append(f"| `{network}` | LoRA of rank {', '.join(map(str, sorted(found)))} on {layers} kernels |")
+    if full:
+        lines.append(f"| trained fully | {', '.join(f'`{p}`' for p in sorted(full))} |")
+    lines += [
+        "",
+        "## Use",
+        "```",
+        "python -m roge_jax.export THIS_FOLDER --merge BASE --out MODEL     # a standalone model folder",
+        "python -m roge_jax.export THIS_FOLDER --style diffusers --out LORA  # the transformer's LoRA for diffusers",
+        "```",
+        f"Video {config.height}x{config.width}, {config.frames} frames per window, up to {config.max_context} photos.",
+        "",
+        "## Training",
+        f"Stage: {provenance.get('stage', 'not recorded')}. Steps: {provenance.get('steps', 'not recorded')}.",
+        f"Data: {provenance.get('data', 'not recorded; name it here before sharing')}.",
+        f"Licence of the data: {provenance.get('data_license', 'not recorded; check it before sharing')}.",
+        "",
+        "## Licences",
+        "An adapter is made from the weights below; their terms go on holding for it and for merged models.",
+        *(f"- {text}" for text in sources),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _sources(provenance: Mapping) -> list[str]:
+    converted = provenance.get("base_provenance", {}).get("converted", [])
+    read = dict.fromkeys(part["option"] for part in converted if part.get("tensors", 1))
+    if not read:
+        return ["The base's own licence (no published weights are recorded in its config.json)."]
+    return [f"{name}: {licence} ({place})" for name, licence, place in (LICENCES[o] for o in read if o in LICENCES)]

@@ -1,0 +1,87 @@
+"""The prompt's text embedding, computed once: text encoders are not needed afterwards.
+
+Rows are those of umT5's last hidden state, cut to the true length of the prompt; the model stores them zero-padded.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from ..config import DiTConfig
+from ..errors import UserError
+from .sources import open_source
+
+EXTRA = 'pip install "roge_jax[convert]" torch'
+
+
+def padded(rows: np.ndarray, cfg: DiTConfig, source: str) -> np.ndarray:
+    """Rows [r, text_dim] (or [1, r, text_dim]) as float32 [text_len, text_dim], zeros behind them."""
+    rows = np.asarray(rows, np.float32)
+    rows = rows[0] if rows.ndim == 3 and rows.shape[0] == 1 else rows
+    if rows.ndim != 2 or rows.shape[1] != cfg.text_dim or not 0 < rows.shape[0] <= cfg.text_len:
+        raise UserError(
+            f"{source}: a prompt embedding of shape {rows.shape} does not fit; needed is [rows, {cfg.text_dim}] "
+            f"with 1 to {cfg.text_len} rows."
+        )
+    if not np.isfinite(rows).all():
+        raise UserError(f"{source}: the prompt embedding is not finite: compute it in bfloat16 or float32.")
+    return np.pad(rows, ((0, cfg.text_len - rows.shape[0]), (0, 0)))
+
+
+def read_prompt(file: Path, cfg: DiTConfig) -> np.ndarray:
+    """[text_len, text_dim] from a .npy file, or the only tensor of a safetensors or PyTorch file."""
+    file = Path(file)
+    if file.suffix == ".npy":
+        try:
+            return padded(np.load(file, allow_pickle=False), cfg, str(file))
+        except (OSError, ValueError) as error:
+            if isinstance(error, UserError):
+                raise
+            raise UserError(f"{file} cannot be read as .npy ({error}): save the rows with numpy.save.") from None
+    source = open_source(file)
+    if len(source.tensors) != 1:
+        raise UserError(f"{file} holds {len(source.tensors)} tensors: give a file with the embedding alone.")
+    (key,) = source.tensors
+    return padded(source.read(key), cfg, str(file))
+
+
+def encode_prompt(folder: Path, text: str, cfg: DiTConfig) -> np.ndarray:
+    """[text_len, text_dim] of `text` by the umT5 encoder in `folder`, in bfloat16 on the CPU.
+
+    `folder` is a Hugging Face one: config, weights and tokenizer in it, or the subfolders `text_encoder` and
+    `tokenizer` of a diffusers model. Needs transformers and torch (extra `convert`), and memory for the encoder.
+    """
+    try:
+        import torch
+        from transformers import AutoTokenizer, UMT5EncoderModel
+    except ImportError as error:
+        raise UserError(f"--t5 needs transformers and torch ({error}): {EXTRA}.") from None
+    folder = Path(folder)
+    encoder = folder / "text_encoder" if (folder / "text_encoder").is_dir() else folder
+    tokens = folder / "tokenizer" if (folder / "tokenizer").is_dir() else folder
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(str(tokens), local_files_only=True)
+        model = UMT5EncoderModel.from_pretrained(str(encoder), dtype=torch.bfloat16, local_files_only=True)
+    except (OSError, ValueError, ImportError) as error:
+        raise UserError(f"--t5 {folder}: no umT5 encoder and tokenizer there ({_first_line(error)}).") from None
+    ids = tokenizer(cleaned(text), truncation=True, max_length=cfg.text_len, return_tensors="pt")
+    with torch.no_grad():
+        rows = model.eval()(input_ids=ids["input_ids"], attention_mask=ids["attention_mask"])
+    return padded(rows.last_hidden_state[0].float().numpy(), cfg, f"--t5 {folder}")
+
+
+def cleaned(text: str) -> str:
+    """The text as Wan cleans it: mojibake mended (if ftfy is there), HTML entities twice, white space collapsed."""
+    import html
+
+    try:
+        import ftfy
+
+        text = ftfy.fix_text(text)
+    except ImportError:
+        pass
+    return " ".join(html.unescape(html.unescape(text)).split())
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0][:200] if str(error).strip() else type(error).__name__

@@ -1,0 +1,90 @@
+"""Random checkpoints in the published names and formats, made through the reverse weight maps."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import ml_dtypes
+import numpy as np
+
+from roge_jax import model
+from roge_jax.config import (
+    DiTConfig,
+    EncoderConfig,
+    FusionConfig,
+    RendererConfig,
+    RoGeConfig,
+    VAEConfig,
+)
+from roge_jax.core.params import flatten, unflatten
+from roge_jax.video.dit import dit_specs
+from roge_jax.weights import lagernvs, mapping, wan_dit, wan_vae
+
+# Head sizes as published (128 and 64), which the files do not tell.
+CONFIG = RoGeConfig(
+    name="test",
+    encoder=EncoderConfig(width=64, heads=1, depth=2, dino_depth=1, position_grid=2),
+    renderer=RendererConfig(width=64, heads=1, depth=3),
+    vae=VAEConfig(base=4, latent=16),
+    dit=DiTConfig(
+        width=128, heads=1, depth=3, ffn=96, freq_dim=16, text_dim=8, text_len=6, clip_dim=12
+    ),
+    fusion=FusionConfig(geometry_channels=8),
+)
+T2V = dataclasses.replace(CONFIG.dit, in_channels=16, clip_dim=0)
+
+
+def random_tree(specs, seed: int) -> dict[str, np.ndarray]:
+    """Float32 values by path."""
+    rng = np.random.default_rng(seed)
+    return {p: rng.standard_normal(s.shape, np.float32) for p, s in flatten(specs).items()}
+
+
+def dit_tensors(cfg: DiTConfig = CONFIG.dit, names="official", seed=1):
+    """(our tree by path, their tensors)."""
+    tree = random_tree(dit_specs(cfg), seed)
+    return tree, mapping.to_theirs(wan_dit.dit_entries(cfg, names=names), unflatten(tree))
+
+
+def vae_tensors(cfg: VAEConfig = CONFIG.vae, names="official", seed=2):
+    tree = random_tree(model.specs(CONFIG)["vae"], seed)
+    return tree, mapping.to_theirs(wan_vae.mapping(cfg, names), unflatten(tree))
+
+
+def recon_tensors(config: RoGeConfig = CONFIG, seed=3):
+    """LagerNVS: ({"encoder/..", "renderer/.."}, tensors with one in bfloat16)."""
+    specs = {k: model.specs(config)[k] for k in ("encoder", "renderer")}
+    tree = random_tree(specs, seed)
+    key = "renderer/registers"  # bfloat16 in the released file, so that it holds exactly these values
+    tree[key] = tree[key].astype(ml_dtypes.bfloat16).astype(np.float32)
+    return tree, lagernvs.published(unflatten(tree), config.encoder, config.renderer)
+
+
+def vggt_tensors(config: RoGeConfig = CONFIG, seed=4):
+    """VGGT-1B with the beginning of one of its heads."""
+    tree = random_tree({"encoder": model.specs(config)["encoder"]}, seed)
+    entries = lagernvs.vggt_entries(config.encoder)
+    tensors = mapping.to_theirs(entries, unflatten(tree))
+    paths = {e.path for e in entries}
+    head = {"camera_head.token_norm.weight": np.ones(4, np.float32)}
+    return {p: x for p, x in tree.items() if p in paths}, tensors | head
+
+
+def save(file: Path, tensors) -> Path:
+    from safetensors.flax import save_file
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    save_file(dict(tensors), file)
+    return file
+
+
+def save_sharded(folder: Path, tensors, shards=3, stem="diffusion_pytorch_model") -> Path:
+    """Shards with an index, keys dealt out in turn."""
+    keys, files = sorted(tensors), {}
+    for i in range(shards):
+        name = f"{stem}-{i + 1:05d}-of-{shards:05d}.safetensors"
+        save(folder / name, {k: tensors[k] for k in keys[i::shards]})
+        files |= dict.fromkeys(keys[i::shards], name)
+    index = {"metadata": {}, "weight_map": files}
+    (folder / f"{stem}.safetensors.index.json").write_text(json.dumps(index))
+    return folder

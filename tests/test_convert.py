@@ -1,0 +1,451 @@
+"""Import of published checkpoints: layouts, formats, mixtures, bad files, memory and interruption."""
+
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import textwrap
+import zipfile
+from pathlib import Path
+
+import ml_dtypes
+import numpy as np
+import published_files as made
+import pytest
+
+from roge_jax import checkpoint, convert, model
+from roge_jax.config import to_dict
+from roge_jax.core import params
+from roge_jax.entry import parse
+from roge_jax.errors import UserError
+from roge_jax.weights import importer, lora_export, shards, sources, wan_dit
+from roge_jax.weights.published import RAYS
+
+CONFIG = made.CONFIG
+BF16 = ml_dtypes.bfloat16
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """One set of checkpoints: a sharded official DiT with its VAE beside it, LagerNVS, the config as a folder."""
+    root = tmp_path_factory.mktemp("published")
+    wan = made.save_sharded(root / "wan", made.dit_tensors()[1])
+    made.save(root / "wan" / "Wan2.1_VAE.safetensors", made.vae_tensors()[1])
+    # The VAE beside the shards must not count as one of them: the index tells.
+    made.save(root / "lagernvs.safetensors", made.recon_tensors()[1])
+    np.save(root / "prompt.npy", np.ones((2, CONFIG.dit.text_dim), np.float32))
+    (root / "config").mkdir()
+    record = {"format": 1, "config": to_dict(CONFIG), "provenance": {}}
+    (root / "config" / "config.json").write_text(json.dumps(record))
+    return {"root": root, "wan": wan, "lagernvs": root / "lagernvs.safetensors", "config": root / "config"}
+
+
+def run(*arguments):
+    convert.main(parse(convert.parser(), [str(a) for a in arguments]))
+
+
+def stored(folder: Path):
+    """All leaves of a model folder as they are on disk."""
+    flat = {}
+    for file in sorted(Path(folder).glob("model-*.safetensors")):
+        source = sources.open_source(file)
+        flat |= {key: np.array(source.read(key)) for key in source.tensors}
+    return flat
+
+
+def everything(files):
+    return [
+        "--wan", files["wan"], "--lagernvs", files["lagernvs"], "--preset", files["config"],
+        "--prompt-embedding", files["root"] / "prompt.npy",
+    ]  # fmt: skip
+
+
+def expected():
+    tree = {f"dit/{p}": x for p, x in made.dit_tensors()[0].items()}
+    tree |= {f"vae/{p}": x for p, x in made.vae_tensors()[0].items()}
+    return tree | made.recon_tensors()[0]
+
+
+# ---- what is converted ---------------------------------------------------------------------------
+
+
+def test_official_files_fill_every_leaf_exactly(files, tmp_path, capsys):
+    run(*everything(files), "--dtype", "float32", "--out", tmp_path / "m", "--shard-gb", 2e-4)
+    got = stored(tmp_path / "m")
+    want = expected()
+    assert got.keys() == params.flatten(model.specs(CONFIG)).keys()
+    for path, value in want.items():
+        np.testing.assert_array_equal(got[path], value, err_msg=path)
+    np.testing.assert_array_equal(got["prompt/rows"][:2], 1)
+    assert not got["prompt/rows"][2:].any() and got["fusion/geometry_adapter/kernel"].std() > 0
+    assert len(list((tmp_path / "m").glob("model-*"))) > 3
+    assert sorted(p.name for p in (tmp_path / "m").iterdir() if "model-" not in p.name) == ["config.json"]
+    tree, config = checkpoint.load_model(tmp_path / "m")
+    assert config == CONFIG
+    np.testing.assert_array_equal(tree["dit"]["head"]["linear"]["kernel"], want["dit/head/linear/kernel"])
+    record = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
+    assert record["initialised"] == sorted(p for p in got if p.startswith("fusion/"))
+    assert [part["option"] for part in record["converted"]] == ["--wan", "--wan-vae", "--lagernvs"]
+    assert "official names" in capsys.readouterr().out
+
+
+def test_bfloat16_is_for_large_frozen_matrices_alone(files, tmp_path):
+    run(*everything(files), "--out", tmp_path / "m")
+    want = expected()
+    for path, value in stored(tmp_path / "m").items():
+        half = path.endswith("/kernel") and path.startswith(("encoder/", "renderer/", "dit/blocks/", "dit/text_embed", "dit/clip_embed"))
+        assert value.dtype == (BF16 if half else np.float32), path
+        if path in want:
+            np.testing.assert_array_equal(value, want[path].astype(value.dtype), err_msg=path)
+    tree, _ = checkpoint.load_model(tmp_path / "m", dtype=None)
+    assert tree["dit"]["blocks"]["ffn"]["fc1"]["kernel"].dtype == BF16
+    assert tree["vae"]["quant"]["kernel"].dtype == np.float32
+
+
+@pytest.mark.parametrize("prefix", ["", "model.diffusion_model."])
+def test_diffusers_layout_and_bfloat16_source(files, tmp_path, prefix):
+    tree, tensors = made.dit_tensors(names="diffusers")
+    tensors = {prefix + k: v.astype(BF16) for k, v in tensors.items()}
+    tensors[f"{prefix}blocks.0.attn2.norm_added_q.weight"] = np.ones(128, np.float32)  # read by nobody
+    made.save_sharded(tmp_path / "repo" / "transformer", tensors)
+    made.save(tmp_path / "repo" / "vae" / "diffusion_pytorch_model.safetensors", made.vae_tensors(names="diffusers")[1])
+    run("--wan", tmp_path / "repo", "--preset", files["config"], "--random", "encoder", "renderer",
+        "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
+    got = stored(tmp_path / "m")
+    for path, value in tree.items():
+        np.testing.assert_array_equal(got[f"dit/{path}"], value.astype(BF16).astype(np.float32), err_msg=path)
+    for path, value in made.vae_tensors()[0].items():
+        np.testing.assert_array_equal(got[f"vae/{path}"], value)
+    assert got["renderer/ray_embed/kernel"].std() > 0
+
+
+def test_text_to_video_is_widened_with_zeros(tmp_path, capsys):
+    """Sizes come from the files here: no preset."""
+    tree, tensors = made.dit_tensors(made.T2V)
+    made.save(tmp_path / "wan" / "diffusion_pytorch_model.safetensors", tensors)
+    run("--wan", tmp_path / "wan", "--random", "encoder", "renderer", "vae", "--dry-run")
+    assert "E1 widened from 16 to 36 channels with zeros" in capsys.readouterr().out
+    plan, _ = convert.make_plan(
+        parse(convert.parser(), ["--wan", str(tmp_path / "wan"), "--random", "encoder", "renderer", "vae"])
+    )
+    assert plan.config.dit.in_channels == 36 and not plan.config.dit.clip_dim
+    (fill,) = [f for f in plan.fills if f.path == "dit/patch_embed/kernel"]
+    kernel = fill.make(fill.source.read(fill.key))
+    assert kernel.shape == plan.specs[fill.path].shape
+    np.testing.assert_array_equal(kernel[:, :, :16], tree["patch_embed/kernel"])
+    assert not kernel[:, :, 16:].any()
+
+
+def test_vggt_alone_fills_the_aggregator(files, tmp_path):
+    tree, tensors = made.vggt_tensors()
+    made.save(tmp_path / "model.safetensors", tensors)
+    run("--wan", files["wan"], "--vggt", tmp_path / "model.safetensors", "--preset", files["config"],
+        "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
+    got = stored(tmp_path / "m")
+    for path, value in tree.items():
+        np.testing.assert_array_equal(got[path], value, err_msg=path)
+    initialised = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]["initialised"]
+    assert {p for p in initialised if p.startswith("encoder/")} == {
+        p for p in got if p.startswith(("encoder/camera_mlp", "encoder/connector"))
+    }
+    assert {p for p in got if p.startswith("renderer/")} <= set(initialised)
+    assert "prompt/rows" in initialised
+
+
+def test_initialised_leaves_are_those_of_a_fresh_model(files, tmp_path):
+    import jax
+
+    made.save(tmp_path / "model.safetensors", made.vggt_tensors()[1])
+    run("--vggt", tmp_path / "model.safetensors", "--random", "dit", "vae", "--preset", files["config"],
+        "--dtype", "float32", "--out", tmp_path / "m", "--seed", 5)  # fmt: skip
+    fresh = params.flatten(model.init(jax.random.key(5), CONFIG))
+    got = stored(tmp_path / "m")
+    for path in ("dit/blocks/ffn/fc1/kernel", "encoder/connector/kernel", "vae/decoder/conv_in/kernel"):
+        np.testing.assert_array_equal(got[path], fresh[path], err_msg=path)
+
+
+def framecrafter(cfg, seed=7, rank=2):
+    rng = np.random.default_rng(seed)
+    layers = ("self_attn/q", "ffn/fc1")
+    specs = params.flatten(params.abstract(made.dit_specs(cfg)))
+    lora = {}
+    for layer in layers:
+        _, d_in, d_out = specs[f"blocks/{layer}/kernel"].shape
+        lora[f"blocks/{layer}/lora_a"] = rng.standard_normal((cfg.depth, d_in, rank), np.float32)
+        lora[f"blocks/{layer}/lora_b"] = rng.standard_normal((cfg.depth, rank, d_out), np.float32)
+    tensors = lora_export.export_lora(params.unflatten(lora), style="framecrafter")
+    embed = rng.standard_normal((cfg.width, 36 + RAYS, 1, 2, 2), np.float32)
+    return lora, tensors | {"patch_embedding.weight": embed, "patch_embedding.bias": np.ones(cfg.width, np.float32)}
+
+
+def test_framecrafter_is_merged_into_the_transformer(files, tmp_path):
+    lora, tensors = framecrafter(CONFIG.dit)
+    made.save(tmp_path / "fc.safetensors", tensors)
+    run(*everything(files), "--framecrafter", tmp_path / "fc.safetensors", "--dtype", "float32", "--out", tmp_path / "m")
+    got, tree = stored(tmp_path / "m"), made.dit_tensors()[0]
+    for layer in ("blocks/self_attn/q", "blocks/ffn/fc1"):
+        want = tree[f"{layer}/kernel"] + lora[f"{layer}/lora_a"] @ lora[f"{layer}/lora_b"]
+        np.testing.assert_allclose(got[f"dit/{layer}/kernel"], want, rtol=0, atol=1e-5)
+    np.testing.assert_array_equal(got["dit/blocks/self_attn/k/kernel"], tree["blocks/self_attn/k/kernel"])
+    whole = wan_dit.PATCH.to_ours(tensors["patch_embedding.weight"])
+    np.testing.assert_array_equal(got["dit/patch_embed/kernel"], whole[:, :, :36])
+    np.testing.assert_array_equal(got["dit/patch_embed/bias"], 1)
+    # One photo, repeated four times in its slot, is embedded as by FrameCrafter.
+    rays = np.random.default_rng(0).standard_normal(RAYS)
+    ours = np.einsum("c,hwcd->hwd", np.tile(rays, 4), got["fusion/rays_embed/kernel"])
+    np.testing.assert_allclose(ours, np.einsum("c,hwcd->hwd", rays, whole[:, :, 36:]), rtol=0, atol=1e-5)
+
+
+# ---- formats -------------------------------------------------------------------------------------
+
+
+def test_pytorch_files(files, tmp_path):
+    torch = pytest.importorskip("torch")
+    tree, tensors = made.recon_tensors()
+    state = {
+        k: torch.from_numpy(v.view(np.uint16)).view(torch.bfloat16) if v.dtype == BF16 else torch.from_numpy(v)
+        for k, v in tensors.items()
+    }
+    key = "renderer.final_layer.linear.weight"
+    state[key] = torch.nn.Parameter(state[key].t().contiguous().t())  # a parameter, with other strides
+    base = torch.zeros(3, *state["renderer.tgt_norm.weight"].shape)
+    base[1] = state["renderer.tgt_norm.weight"]
+    state["renderer.tgt_norm.weight"] = base[1]  # a view into a larger storage
+    torch.save({"model": state, "step": 3}, tmp_path / "model.pt")
+    vae = made.vae_tensors()[1]
+    torch.save({k: torch.from_numpy(v) for k, v in vae.items()}, tmp_path / "Wan2.1_VAE.pth")
+    run("--wan", files["wan"], "--wan-vae", tmp_path / "Wan2.1_VAE.pth", "--lagernvs", tmp_path / "model.pt",
+        "--preset", files["config"], "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
+    got = stored(tmp_path / "m")
+    for path, value in {**tree, **{f"vae/{p}": x for p, x in made.vae_tensors()[0].items()}}.items():
+        np.testing.assert_array_equal(got[path], value, err_msg=path)
+    torch.save(state, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(UserError, match=r"old\.pt is not a PyTorch zip file"):
+        sources.open_source(tmp_path / "old.pt")
+    cut = tmp_path / "cut.pt"
+    cut.write_bytes((tmp_path / "model.pt").read_bytes()[:-1000])
+    with pytest.raises(UserError, match=r"cut\.pt is truncated"):
+        sources.open_source(cut)
+
+
+def pytorch_zip(file: Path, content: bytes) -> Path:
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("archive/data.pkl", content)
+        archive.writestr("archive/data/0", bytes(64))
+    return file
+
+
+def tensor_pickle(shape: str, strides: str, start=0) -> bytes:
+    """A PyTorch pickle of {"w": tensor of float32 storage 0 with 16 elements}, written opcode by opcode."""
+    storage = b"(Vstorage\nctorch\nFloatStorage\nV0\nVcpu\nI16\ntQ"
+    arguments = b"(" + storage + f"I{start}\n{shape}{strides}".encode() + b"I00\n}t"
+    return b"}Vw\nctorch._utils\n_rebuild_tensor_v2\n" + arguments + b"Rs."
+
+
+def test_pytorch_pickle_by_hand(tmp_path):
+    file = pytorch_zip(tmp_path / "a.pt", tensor_pickle("(I2\nI3\nt", "(I1\nI2\nt", 1))
+    source = sources.open_source(file)
+    assert source.shapes == {"w": (2, 3)} and source.read("w").shape == (2, 3)
+    for shape, strides, start in (("(I2\nI9\nt", "(I9\nI1\nt", 0), ("(I4\nt", "(I1\nt", 13), ("(I4\nt", "(I-1\nt", 8)):
+        with pytest.raises(UserError, match="reaches outside its storage"):
+            sources.open_source(pytorch_zip(tmp_path / "b.pt", tensor_pickle(shape, strides, start)))
+
+
+@pytest.mark.parametrize(
+    "call", [(os.system, ("touch {mark}",)), (eval, ("open('{mark}', 'w')",)), (getattr, (os, "sep"))]
+)
+def test_a_pickle_cannot_execute_code(tmp_path, call):
+    mark = tmp_path / "executed"
+    function, arguments = call
+
+    class Attack:
+        def __reduce__(self):
+            return function, tuple(a.format(mark=mark) if isinstance(a, str) else a for a in arguments)
+
+    try:
+        content = pickle.dumps({"w": Attack()}, protocol=2)
+    except TypeError:  # modules cannot be pickled: name the function alone
+        content = pickle.dumps({"w": function}, protocol=2)
+    file = pytorch_zip(tmp_path / "model.pt", content)
+    with pytest.raises(UserError, match=r"model\.pt tries to execute code: it asks for"):
+        sources.open_source(file)
+    assert not mark.exists()
+    with pytest.raises(UserError, match="cannot be read"):
+        sources.open_source(pytorch_zip(tmp_path / "model.pt", b"nonsense"))
+
+
+# ---- bad input -----------------------------------------------------------------------------------
+
+
+def fails(match, *arguments):
+    with pytest.raises(UserError, match=match) as caught:
+        run(*arguments, "--dry-run")
+    assert "\n" not in str(caught.value)
+
+
+def test_wrong_family(files, tmp_path):
+    wan, lagernvs, preset = files["wan"], files["lagernvs"], ["--preset", files["config"]]
+    fails(r"lagernvs\.safetensors holds LagerNVS .* but --wan takes", "--wan", lagernvs)
+    fails(r"wan holds a Wan transformer .* but --lagernvs takes", "--lagernvs", wan)
+    fails(r"holds LagerNVS .* but --vggt takes VGGT-1B", "--vggt", lagernvs)
+    fails(r"holds LagerNVS .* --wan-vae takes the Wan2.1 VAE", "--wan", wan, "--wan-vae", lagernvs, "--lagernvs", lagernvs, *preset)
+    fails(r"--framecrafter takes FrameCrafter's LoRA", "--wan", wan, "--framecrafter", lagernvs)
+    made.save(tmp_path / "t5.safetensors", {"encoder.embed_tokens.weight": np.ones((2, 2), np.float32)})
+    fails("holds a T5 text encoder", "--wan", tmp_path / "t5.safetensors")
+    fails("width 128 with 3 blocks, and preset 'wan1.3b' has 1536", "--wan", wan, "--preset", "wan1.3b")
+    fails("Unknown preset 'papr': did you mean 'paper'", "--wan", wan, "--preset", "papr")
+    fails("has no DINOv2 patch encoder", "--lagernvs", lagernvs, "--random", "dit", "vae", "--preset", "tiny")
+
+
+def test_missing_parts(files, tmp_path):
+    wan = files["wan"]
+    fails("Nothing fills encoder, renderer: give --lagernvs", "--wan", wan)
+    fails("--random dit, but a file fills it", "--wan", wan, "--random", "dit", "encoder", "renderer")
+    fails("--framecrafter holds changes", "--framecrafter", wan)
+    fails("does not exist", "--wan", tmp_path / "nowhere.safetensors")
+    (tmp_path / "empty").mkdir()
+    fails("holds no safetensors", "--wan", tmp_path / "empty")
+    with pytest.raises(UserError, match="No --out given"):
+        run("--wan", wan)
+
+
+def test_missing_shard_and_truncated_file(files, tmp_path):
+    tensors = made.dit_tensors()[1]
+    folder = made.save_sharded(tmp_path / "wan", tensors)
+    second = folder / "diffusion_pytorch_model-00002-of-00003.safetensors"
+    content = second.read_bytes()
+    second.unlink()
+    fails("diffusion_pytorch_model-00002-of-00003.safetensors missing", "--wan", folder)
+    (folder / "diffusion_pytorch_model.safetensors.index.json").rename(tmp_path / "index")
+    fails("shard 2 of 3 is missing", "--wan", folder)
+    (tmp_path / "index").rename(folder / "diffusion_pytorch_model.safetensors.index.json")
+    second.write_bytes(content[:-10])
+    fails(r"00002-of-00003\.safetensors is truncated: .* tensor '.*' is cut off", "--wan", folder)
+    second.write_bytes(content[:100])
+    fails("truncated", "--wan", folder)
+    second.write_bytes(b"")
+    fails("not a safetensors file", "--wan", folder)
+    made.save(second, {"patch_embedding.weight": np.ones(2, np.float32)})
+    fails(r"00002-of-00003.safetensors lacks tensor", "--wan", folder)
+
+
+def test_all_mismatches_are_in_one_error(files, tmp_path):
+    tensors = made.dit_tensors()[1]
+    for i in range(3):
+        del tensors[f"blocks.{i}.norm3.bias"]
+    del tensors["blocks.1.ffn.2.weight"]
+    tensors["vace_blocks.0.weight"] = np.ones(3, np.float32)
+    tensors["head.head.bias"] = np.ones(5, np.float32)
+    tensors["blocks.2.self_attn.q.weight"] = np.ones((128, 128), np.int32)
+    made.save(tmp_path / "wan.safetensors", tensors)
+    recon = made.recon_tensors()[1]
+    del recon["renderer.tgt_norm.weight"]
+    made.save(tmp_path / "lagernvs.safetensors", recon)
+    with pytest.raises(UserError) as caught:
+        run("--wan", tmp_path / "wan.safetensors", "--lagernvs", tmp_path / "lagernvs.safetensors",
+            "--random", "vae", "--preset", files["config"], "--dry-run")  # fmt: skip
+    text = str(caught.value)
+    assert text.startswith("8 tensors do not fit")
+    for line in (
+        "blocks.{0..2}.norm3.bias is missing",
+        "blocks.1.ffn.2.weight is missing",
+        "vace_blocks.0.weight is not expected",
+        "head.head.bias has shape (5,) instead of (64,)",
+        "blocks.2.self_attn.q.weight has dtype int32",
+        "renderer.tgt_norm.weight is missing",
+        "wan.safetensors: ",
+        "lagernvs.safetensors: ",
+    ):
+        assert line in text, line
+
+
+def test_output_and_disk(files, tmp_path, monkeypatch):
+    (tmp_path / "m").mkdir()
+    (tmp_path / "m" / "mine.txt").write_text("x")
+    with pytest.raises(UserError, match="exists already"):
+        run(*everything(files), "--out", tmp_path / "m")
+    usage = importer.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(importer.shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(UserError, match=r"needs 0\.0\d GB at .*, where 0\.00 GB are free"):
+        run(*everything(files), "--out", tmp_path / "new")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["m"]
+
+
+def test_a_full_disk_leaves_nothing(files, tmp_path, monkeypatch):
+    def full(file, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(shards, "_write_all", full)
+    with pytest.raises(UserError, match="disk is full"):
+        run(*everything(files), "--out", tmp_path / "m")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("shape", [(2, 7), (7, 8), (0, 8)])
+def test_prompt_embedding_of_wrong_shape(files, tmp_path, shape):
+    np.save(tmp_path / "p.npy", np.ones(shape, np.float32))
+    fails("prompt embedding of shape", *everything(files)[:-1], tmp_path / "p.npy")
+
+
+# ---- interruption --------------------------------------------------------------------------------
+
+
+KILLED = """
+    import os, signal, sys
+    from roge_jax import convert
+    from roge_jax.entry import parse
+    from roge_jax.weights import importer, shards
+
+    importer.FLUSH_BYTES = 100_000
+    write, count = shards.Shards.write, 0
+
+    def counted(self, path, value, layer=None):
+        global count
+        count += 1
+        if count == 60:
+            os.kill(os.getpid(), signal.SIGKILL)
+        write(self, path, value, layer)
+
+    shards.Shards.write = counted
+    convert.main(parse(convert.parser(), sys.argv[1:]))
+"""
+
+
+def test_a_killed_conversion_resumes_to_the_same_files(files, tmp_path, monkeypatch):
+    arguments = [*everything(files), "--shard-gb", "0.0005"]
+    run(*arguments, "--out", tmp_path / "whole")
+    killed = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(KILLED), *map(str, arguments), "--out", str(tmp_path / "m")],
+        cwd=tmp_path, env=os.environ | {"XLA_FLAGS": ""}, capture_output=True,
+    )  # fmt: skip
+    assert killed.returncode == -signal.SIGKILL, killed.stderr.decode()[-2000:]
+    assert not (tmp_path / "m").exists()
+    done = int((tmp_path / "m.part" / importer.PROGRESS).read_text())
+    assert 0 < done < 60
+    with pytest.raises(UserError, match="was begun with another 'dtype'"):
+        run(*arguments, "--out", tmp_path / "m", "--dtype", "float32", "--shard-gb", "0.0005", "--resume")
+    written = []
+    write = shards.Shards.write
+
+    def counted(self, path, value, layer=None):
+        written.append(path)
+        write(self, path, value, layer)
+
+    monkeypatch.setattr(shards.Shards, "write", counted)
+    run(*arguments, "--out", tmp_path / "m", "--resume")
+    plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in arguments]))
+    assert len(written) == len(plan.fills) + len(plan.given) + len(plan.initialised) - done
+    names = sorted(p.name for p in (tmp_path / "whole").iterdir())
+    assert sorted(p.name for p in (tmp_path / "m").iterdir()) == names
+    for name in names:
+        assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+
+
+def test_without_resume_it_starts_over(files, tmp_path):
+    part = tmp_path / "m.part"
+    part.mkdir()
+    (part / "model-00009-of-00009.safetensors").write_bytes(b"left over")
+    run(*everything(files), "--out", tmp_path / "m")
+    assert not part.exists() and not (tmp_path / "m" / "model-00009-of-00009.safetensors").exists()
