@@ -64,7 +64,7 @@ def alter(rng: np.random.Generator, rgb: np.ndarray, K: np.ndarray, c2w: np.ndar
     if rng.random() < 0.2:
         rgb = 1.0 - rgb
     grey = rgb.mean(-1, keepdims=True)
-    rgb = grey + rng.uniform(0.3, 1.2) * (rgb - grey)
+    rgb = grey + rng.uniform(0.3, 1.8) * (rgb - grey)
     return np.clip(rgb, 0.0, 1.0) ** rng.uniform(0.7, 1.4), K, c2w
 
 
@@ -100,8 +100,13 @@ def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray
     }
 
 
-def draw_batch(pool, seed: int, index: int, batch: int, cfg: ViewConfig, *, scale_rule: str) -> dict:
+def draw_batch(
+    pool, seed: int, index: int, batch: int, cfg: ViewConfig, *, scale_rule: str, rows=None
+) -> dict:
     """Batch number `index`: arrays of `make_sample` with a leading batch axis; one M for the whole batch.
+
+    M is a function of (seed, index), sample j of (seed, index, j): whoever draws only some `rows` of the batch (the
+    processes of a run on many machines) gets the same samples, and the same M.
 
     `pool[i]` is a sequence: `rgb` [f, h, w, 3] uint8, `K` [f, 3, 3], `c2w` [f, 4, 4]; frames are averaged down to
     `cfg.size`, of which their size must be a multiple.
@@ -110,7 +115,8 @@ def draw_batch(pool, seed: int, index: int, batch: int, cfg: ViewConfig, *, scal
     weights = np.asarray(cfg.context_weights) / sum(cfg.context_weights)
     m = int(rng.choice(cfg.contexts, p=weights))
     samples = []
-    for _ in range(batch):
+    for j in range(batch) if rows is None else rows:
+        rng = np.random.default_rng([seed, index, 2 + int(j)])  # [.., 0] would repeat the stream of M
         sequence = pool[int(rng.integers(len(pool)))]
         contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
         views = np.concatenate([contexts, targets])
