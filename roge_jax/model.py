@@ -24,6 +24,7 @@ from .config import RoGeConfig
 from .core.lora import attach, lora_specs
 from .core.params import Spec, Tree, flatten, unflatten, zeros
 from .core.params import init as init_specs
+from .core.sharding import batch_axes
 from .fusion import Condition
 from .geometry.rays import plucker
 from .recon import ray_scene, vggt
@@ -314,10 +315,11 @@ def loss(
     beside the frozen kernels they adapt. What trains is therefore an argument.
     """
     params = attach(frozen, trainable)
-    keys = jax.random.split(key, batch["K"].shape[0])
+    scenes = batch["K"].shape[0]
     terms = jax.vmap(
-        lambda views, key: scene_loss(params, views, key, config=config, draws=draws, remat=remat)
-    )(batch, keys)
+        lambda views, key: scene_loss(params, views, key, config=config, draws=draws, remat=remat),
+        spmd_axis_name=batch_axes(scenes),
+    )(batch, jax.random.split(key, scenes))
     terms = {name: value.mean() for name, value in terms.items()}
     return terms["flow"] + config.flow.photometric * terms["photometric"], terms
 

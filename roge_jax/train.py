@@ -11,6 +11,7 @@ Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) a
 import argparse
 import dataclasses
 import functools
+import math
 import os
 from pathlib import Path
 
@@ -40,7 +41,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--size", help="HEIGHTxWIDTH of stage hires (default: 1.5 times the model's)")
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
-    p.add_argument("--devices", type=int, help="devices to split the batch over (default: all)")
+    p.add_argument("--devices", type=int, help="devices to use, on one machine (default: all)")
+    p.add_argument(
+        "--mesh",
+        help="how to split the work, e.g. data=2,fsdp=2,seq=2: scenes, weights, tokens and views of a\n"
+        "scene (default: all devices on data); see docs/scaling.md, also for several machines",
+    )
+    p.add_argument("--show-mesh", action="store_true", help="print where every leaf lies, then train")
     p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
     p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
     p.add_argument("--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes")
@@ -65,11 +72,20 @@ class ProceduralSource:
 
 
 def main(args: argparse.Namespace) -> None:
-    if args.devices and "jax" not in globals():
+    from .core import distributed, sharding
+
+    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    wanted = args.devices or math.prod(sizes.values())
+    if wanted > 1 and not distributed.launch_arguments(os.environ):
+        # A CPU shows as many devices as it is asked for; other platforms ignore the flag.
         os.environ["XLA_FLAGS"] = (
-            f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={args.devices}"
+            f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={wanted}"
         )
     import jax
+
+    distributed.maybe_initialise_distributed()
+    devices = jax.devices()[: args.devices] if args.devices else jax.devices()
+    mesh = sharding.make_mesh(**sizes, devices=devices) if len(devices) > 1 or sizes else None
 
     from . import checkpoint, config
     from .training import stages as stages_
@@ -92,7 +108,7 @@ def main(args: argparse.Namespace) -> None:
     if args.stage == "hires":
         cfg = resize(cfg, args.size)
     for stage in chosen:
-        params, cfg = run_stage(args, stage, params, cfg)
+        params, cfg = run_stage(args, stage, params, cfg, mesh)
 
 
 def resize(cfg, size: str | None):
@@ -115,16 +131,28 @@ def resize(cfg, size: str | None):
     )
 
 
-def run_stage(args, stage, params, cfg):
+def check_batch(batch: int, mesh) -> None:
+    """Raise UserError if the mesh cannot split a batch of this size."""
+    from .errors import UserError
+
+    data = mesh.shape["data"]
+    if batch % data:
+        raise UserError(
+            f"A batch of {batch} cannot be split over data={data}: use --batch {max(data, batch // data * data)}, or "
+            f"--mesh with a data that divides {batch}."
+        )
+
+
+def run_stage(args, stage, params, cfg, mesh=None):
     """Train one stage and save its model; returns (params, config) for the next."""
     import jax
 
     from . import checkpoint, model
+    from .core import distributed, sharding
     from .core.lora import attach, merge
-    from .core.params import count, flatten
+    from .core.params import count, flatten, unflatten
     from .core.params import init as init_specs
     from .data.pool import read_pool
-    from .errors import UserError
     from .training import loop, stages
 
     out = args.out / stage.name
@@ -136,36 +164,35 @@ def run_stage(args, stage, params, cfg):
     stage = dataclasses.replace(stage, **{k: v for k, v in changes.items() if v})
     if args.lr:
         stage = dataclasses.replace(stage, optim=dataclasses.replace(stage.optim, learning_rate=args.lr))
-    devices = args.devices or jax.device_count()
-    if stage.batch % devices:
-        raise UserError(
-            f"A batch of {stage.batch} cannot be split over {devices} devices: use --batch "
-            f"{max(devices, stage.batch // devices * devices)} or --devices 1."
-        )
+    if mesh is not None:
+        check_batch(stage.batch, mesh)
+    rows = distributed.local_rows(mesh, stage.batch)
     working = stages.stage_config(cfg, stage)
     if args.data:
         source = read_pool(args.data)
     else:
         source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
     trainable, frozen = model.split(params, stage.trains)
-    specs, _ = model.split(model.specs(cfg), stage.trains)
+    specs, frozen_specs = model.split(model.specs(cfg), stage.trains)
     if stage.lora:
         added = stages.new_leaves(cfg, stage)
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
         specs = attach(specs, added)
     if stage.objective in ("vae", "recon"):
-        frozen = {}
-    print(
+        frozen, frozen_specs = {}, {}
+    if mesh is not None:  # now, so that no device ever holds all of it twice
+        frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
+    say = print if distributed.is_main() else (lambda *_: None)
+    if args.show_mesh and mesh is not None:
+        say(f"trains: {sharding.describe(specs, mesh)}\nfrozen: {sharding.describe(frozen_specs, mesh)}")
+    layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
+    say(
         f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
-        f"{stage.batch} scenes at {working.height}x{working.width}, {devices} x {jax.devices()[0].device_kind}"
+        f"{stage.batch} scenes at {working.height}x{working.width}, {layout} ({jax.devices()[0].device_kind})"
     )
     objective = functools.partial(stages.OBJECTIVES[stage.objective], config=working, stage=stage)
-    mesh = None
-    if devices > 1:
-        axis = (jax.sharding.AxisType.Auto,)
-        mesh = jax.make_mesh((devices,), ("data",), axis_types=axis, devices=jax.devices()[:devices])
     writer = None
-    if args.tensorboard:
+    if args.tensorboard and distributed.is_main():
         from tensorboardX import SummaryWriter
 
         writer = SummaryWriter(str(out / "tensorboard"))
@@ -177,7 +204,7 @@ def run_stage(args, stage, params, cfg):
         trainable,
         frozen,
         specs,
-        lambda i: stages.stage_batch(source, stage, working, args.seed, i),
+        lambda i: stages.stage_batch(source, stage, working, args.seed, i, rows),
         optim=stage.optim,
         loop=loop.LoopConfig(
             steps=stage.steps, seed=args.seed, log_every=args.log_every, save_every=args.save_every
@@ -185,23 +212,24 @@ def run_stage(args, stage, params, cfg):
         out=out,
         resume=args.resume,
         mesh=mesh,
+        frozen_specs=frozen_specs,
+        batch=stage.batch,
         name=stage.name,
         evaluate=evaluate,
         evaluate_every=args.evaluate_every,
         writer=writer,
     )
     learned = state.get("ema", state["params"])
-    learned = jax.device_get(learned)
+    learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    from .core.params import unflatten
-
     params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stage.objective == "vae":
         cfg = stages.measure_latents(params, source, cfg, args.seed)
     provenance = {"stage": stage.name, "steps": int(state["step"]), "skipped": int(state["skipped"])}
-    checkpoint.save_model(out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance)
-    print(f"{stage.name}: saved {out / 'model'}")
+    if distributed.is_main():
+        checkpoint.save_model(out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance)
+    say(f"{stage.name}: saved {out / 'model'}")
     return params, cfg
 
 

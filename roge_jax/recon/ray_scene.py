@@ -26,6 +26,7 @@ from ..core.layers import (
     unpatchify,
 )
 from ..core.params import Spec, Tree, fan_in, normal, stack, zeros
+from ..core.sharding import constrain, ways
 from .relative import Relative, inside, to_key, to_output, to_query
 
 EPS = 1e-5
@@ -54,7 +55,8 @@ def attend(p: Tree, x, context, heads: int, *, rq: Relative | None = None, rk: R
     if rq is not None:
         q, k, v = to_query(rq, q), _keys(rk, k), _keys(rk, v)
     dtype = p["q"]["kernel"].dtype
-    if context.shape[0] == 1 and x.shape[0] > 1:  # one matrix product for all views
+    # One matrix product for all views, unless they are on different devices.
+    if context.shape[0] == 1 and x.shape[0] > 1 and ways("seq") == 1:
         y = attention(q.reshape(1, -1, *q.shape[2:]), k, v, dtype=dtype).reshape(q.shape)
     else:
         y = attention(q, k, v, dtype=dtype)
@@ -202,6 +204,7 @@ def query_rays(
 
     @functools.partial(jax.checkpoint, static_argnums=())
     def some(plucker, project, unproject):
+        plucker = constrain(plucker, ("views", None, None, None))
         own = None if rays is None else Relative(project, unproject, rays.angles)
         return _query(p, z, levels, plucker, cfg=cfg, rays=own, cameras=cameras, collect=collect)
 
@@ -217,10 +220,11 @@ def query_rays(
             if t is None:
                 return None
             t = jnp.concatenate([t, jnp.repeat(t[-1:], pad, 0)])
-            return t.reshape(chunks, cfg.chunk, *t.shape[1:])
+            # A chunk takes every `chunks`-th view: devices that share chunks keep neighbouring views.
+            return jnp.swapaxes(t.reshape(cfg.chunk, chunks, *t.shape[1:]), 0, 1)
 
         x, out = jax.lax.map(lambda args: some(*args), tuple(split(t) for t in (plucker, project, unproject)))
-        x = x.reshape(chunks * cfg.chunk, *x.shape[2:])[:v]
+        x = jnp.swapaxes(x, 0, 1).reshape(chunks * cfg.chunk, *x.shape[2:])[:v]
     features = x.reshape(v, h // cfg.patch, w // cfg.patch, -1)
     return (features, out) if collect else features
 
@@ -233,7 +237,11 @@ def _query(p, z, levels, plucker, *, cfg, rays, cameras, collect):
     x = jnp.concatenate([jnp.broadcast_to(registers[None], (v, *registers.shape)), x], 1)
 
     def checkpointed(step):
-        return jax.checkpoint(lambda carry, p: ((y := step(carry, p)), y if collect else None))
+        def per_view(carry, p):
+            y = jax.tree.map(lambda t: constrain(t, ("views", None, None)), step(carry, p))
+            return y, y if collect else None
+
+        return jax.checkpoint(per_view)
 
     if cfg.attention == "full":
 

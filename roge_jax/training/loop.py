@@ -3,9 +3,14 @@
 Steps whose loss or gradient is not finite change nothing and are counted; too many of them, or a loss that leaves its
 best level for good, stop the run with the reason. Batch and randomness of step i are functions of (seed, i), so a
 resumed run continues bit for bit; checkpoints are written atomically and the last few are kept.
+
+A skipped step keeps its place in the order of the data but does not count for the learning-rate schedule, which runs
+on applied updates. After a resume the divergence detector starts afresh; everything else continues.
 """
 
+import contextlib
 import json
+import os
 import queue
 import threading
 import time
@@ -19,7 +24,10 @@ import numpy as np
 import optax
 from tqdm import tqdm
 
+from ..core import sharding
+from ..core.distributed import global_batch, is_main
 from ..core.params import Tree
+from ..errors import UserError
 from .optim import OptimConfig, ema_update, make_optimiser
 
 
@@ -64,7 +72,7 @@ def make_step(objective: Callable, optimiser: optax.GradientTransformation, opti
         (loss, terms), grads = jax.value_and_grad(objective, has_aux=True)(
             state["params"], frozen, batch, key
         )
-        norm = optax.global_norm(grads)
+        norm = optax.tree.norm(grads)
         ok = jnp.isfinite(loss) & jnp.isfinite(norm)
         updates, opt = optimiser.update(grads, state["opt"], state["params"])
         new = {"params": optax.apply_updates(state["params"], updates), "opt": opt}
@@ -83,22 +91,28 @@ def make_step(objective: Callable, optimiser: optax.GradientTransformation, opti
 
 
 class DivergenceDetector:
-    """Says when a smoothed loss has left its best level for good: > best + 6 MAD for `patience` steps."""
+    """Says when a smoothed loss has left its best level for good: > best + 6 MAD for `patience` steps.
+
+    The mean absolute deviation is that of single losses when the average was at its best, so that a jump does not
+    widen its own limit; nothing is judged while the averages fill.
+    """
 
     def __init__(self, patience: int, rate: float = 0.02):
         self.patience, self.rate = patience, rate
-        self.average: float | None = None
-        self.spread, self.best, self.beyond = 0.0, float("inf"), 0
+        self.seen, self.average, self.spread = 0, 0.0, 0.0
+        self.best, self.best_spread, self.beyond = float("inf"), 0.0, 0
 
     def update(self, loss: float) -> bool:
         if not np.isfinite(loss):
             return False  # skipped steps have their own limit
-        if self.average is None:
-            self.average = loss
-        self.spread += self.rate * (abs(loss - self.average) - self.spread)
-        self.average += self.rate * (loss - self.average)
-        self.best = min(self.best, self.average)
-        self.beyond = self.beyond + 1 if self.average > self.best + 6 * self.spread else 0
+        self.seen += 1
+        rate = max(self.rate, 1.0 / self.seen)
+        self.average += rate * (loss - self.average)
+        self.spread += rate * (abs(loss - self.average) - self.spread)
+        filling = self.seen < 2 / self.rate
+        if filling or self.average < self.best:
+            self.best, self.best_spread = self.average, self.spread
+        self.beyond = self.beyond + 1 if self.average > self.best + 6 * self.best_spread else 0
         return self.beyond >= self.patience
 
 
@@ -148,70 +162,110 @@ def train(
     out: Path,
     resume: bool = False,
     mesh: jax.sharding.Mesh | None = None,
+    frozen_specs: Tree | None = None,
+    batch: int | None = None,
     name: str = "train",
     evaluate: Callable[[Tree], dict] | None = None,
     evaluate_every: int = 0,
+    diagnose: Callable[[Tree, Tree, dict, jax.Array], dict] | None = None,
+    diagnose_every: int = 0,
     writer=None,
 ) -> Tree:
     """Run `loop.steps` steps; returns the final state. Logs to out/log.jsonl, checkpoints in out/checkpoints.
 
-    `specs` are those of `trainable`. With a `mesh` the batch is split over its `data` axis. `evaluate(params)` of the
-    averaged parameters is logged every `evaluate_every` steps. `writer` has TensorBoard's `add_scalar`.
+    `specs` are those of `trainable`. With a `mesh` (see `core.sharding`) state and frozen weights lie where its table
+    says (frozen ones on every device without `frozen_specs`). In a run of several processes `batches(i)` returns this
+    process' `core.distributed.local_rows` of the `batch` scenes; the main process writes the log.
+
+    `evaluate(params)` of the averaged parameters is logged every `evaluate_every` steps and stops the run when it is not finite.
+    `diagnose(params, frozen, batch, key)` (see `training.diagnose`) is logged every `diagnose_every` steps. `writer`
+    has TensorBoard's `add_scalar`.
+
+    Raises `TrainingStopped` when the run cannot go on, `UserError` when `out` holds another run.
     """
     from ..checkpoint import Checkpoints
 
     out.mkdir(parents=True, exist_ok=True)
     optimiser = make_optimiser(optim, specs, loop.steps)
     state = initial_state(trainable, optimiser, optim)
-    batch_sharding = None
+    where = None
     if mesh is not None:
-        everywhere = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec())
-        batch_sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("data"))
-        state, frozen = jax.device_put(state, everywhere), jax.device_put(frozen, everywhere)
+        everywhere = sharding.replicated(mesh)
+        where = sharding.state_shardings(state, specs, mesh), everywhere
+        state = sharding.place(state, where[0])
+        frozen = sharding.place(
+            frozen, everywhere if frozen_specs is None else sharding.shardings(frozen_specs, mesh)
+        )
     checkpoints = Checkpoints(out / "checkpoints", keep=loop.keep)
     log_path = out / "log.jsonl"
-    if resume and checkpoints.latest() is not None:
+    if checkpoints.latest() is None:
+        if is_main():
+            log_path.unlink(missing_ok=True)
+    elif resume:
         state = checkpoints.restore(state)
-        _cut_log(log_path, int(state["step"]))
-    elif log_path.exists():
-        log_path.unlink()
-    step = jax.jit(make_step(objective, optimiser, optim), donate_argnums=0)
+        if is_main():
+            _cut_log(log_path, int(state["step"]))
+    else:
+        raise UserError(
+            f"{out} holds a run at step {checkpoints.latest()}: continue it with --resume, or choose another folder."
+        )
+    step = jax.jit(make_step(objective, optimiser, optim), donate_argnums=0, out_shardings=where)
     key = jax.random.key(loop.seed)
     first, detector = int(state["step"]), DivergenceDetector(loop.patience)
     started, logged, terms = time.perf_counter(), first, []
-    bar = tqdm(total=loop.steps, initial=first, desc=name, dynamic_ncols=True, mininterval=1.0)
-    with log_path.open("a") as log, bar:
-        for i, batch in enumerate(prefetched(batches, first, loop.steps), first):
-            if batch_sharding is not None:
-                batch = jax.device_put(batch, batch_sharding)
-            state, metrics = step(state, frozen, batch, jax.random.fold_in(key, i))
+    bar = tqdm(
+        total=loop.steps, initial=first, desc=name, dynamic_ncols=True, mininterval=1.0, disable=not is_main()
+    )
+    source = contextlib.closing(prefetched(batches, first, loop.steps))
+
+    log_file = log_path if is_main() else Path(os.devnull)
+    with log_file.open("a") as log, bar, contextlib.closing(checkpoints), source as ready, sharding.use(mesh):
+        for i, views in enumerate(ready, first):
+            if mesh is not None:
+                views = global_batch(views, mesh, batch or len(next(iter(views.values()))))
+            state, metrics = step(state, frozen, views, jax.random.fold_in(key, i))
             metrics = {k: float(v) for k, v in metrics.items()}
             terms.append(metrics)
             bar.update()
             done = i + 1
-            if done % loop.log_every == 0 or done == loop.steps:
+            reason = _why_stop(metrics, done, loop, detector)
+
+            def due(every: int, done: int = done) -> bool:
+                return every > 0 and (done % every == 0 or done == loop.steps)
+
+            extra = {}
+            if evaluate and due(evaluate_every):
+                extra = evaluate(state.get("ema", state["params"]))
+                wrong = [k for k, v in extra.items() if not np.isfinite(v)]
+                reason = reason or (f"the evaluation gave {wrong[0]} = {extra[wrong[0]]}" if wrong else None)
+            if diagnose and due(diagnose_every):
+                extra = extra | diagnose(state["params"], frozen, views, jax.random.fold_in(key, i))
+            # A line ends at every checkpoint, so that the log of a resumed run has the same lines.
+            if extra or reason or due(loop.log_every) or due(loop.save_every):
                 rate = (done - logged) / max(time.perf_counter() - started, 1e-9)
-                row = _mean_row(terms) | {"step": done, "steps_per_s": rate}
-                if evaluate and evaluate_every and (done % evaluate_every == 0 or done == loop.steps):
-                    row |= evaluate(state.get("ema", state["params"]))
+                row = _mean_row(terms) | {"step": done, "steps_per_s": rate} | _finite(extra)
                 log.write(json.dumps(row) + "\n")
                 log.flush()
                 if writer is not None:
                     for term, value in row.items():
-                        writer.add_scalar(f"{name}/{term}", value, done)
-                bar.set_postfix(loss=f"{row['loss']:.4g}", refresh=False)
+                        if value is not None:
+                            writer.add_scalar(f"{name}/{term}", value, done)
+                if row["loss"] is not None:
+                    bar.set_postfix(loss=f"{row['loss']:.4g}", refresh=False)
                 terms, logged, started = [], done, time.perf_counter()
-            reason = _why_stop(metrics, done, loop, detector)
-            if reason is None and (done % loop.save_every == 0 or done == loop.steps):
-                checkpoints.save(done, state)
             if reason is not None:
-                checkpoints.close()
-                raise TrainingStopped(
-                    f"Stopped at step {done}: {reason}. The last good checkpoint is step "
-                    f"{checkpoints.latest()} in {checkpoints.folder}."
-                )
-    checkpoints.close()
+                last = checkpoints.latest()
+                where = f"step {last} in {checkpoints.folder}" if last else "none: it ended before the first"
+                raise TrainingStopped(f"Stopped at step {done}: {reason}. The last good checkpoint is {where}.")
+            suspect = detector.beyond > 0 and done < loop.steps  # do not push good checkpoints out
+            if due(loop.save_every) and not suspect:
+                checkpoints.save(done, state)
     return state
+
+
+def _finite(values: dict) -> dict:
+    """JSON has no NaN: what is not finite becomes null."""
+    return {name: float(v) if np.isfinite(v) else None for name, v in values.items()}
 
 
 def _mean_row(terms: list[dict]) -> dict:
@@ -237,9 +291,14 @@ def _why_stop(metrics: dict, done: int, loop: LoopConfig, detector: DivergenceDe
 
 
 def _cut_log(path: Path, step: int) -> None:
-    """Drop log lines written after the checkpoint that is being resumed."""
-    if path.exists():
-        lines = [line for line in path.read_text().splitlines() if json.loads(line)["step"] <= step]
-        temporary = path.with_suffix(".part")
-        temporary.write_text("".join(f"{line}\n" for line in lines))
-        temporary.replace(path)
+    """Drop log lines written after the checkpoint that is being resumed, and a line cut off while being written."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        with contextlib.suppress(json.JSONDecodeError):
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+    temporary = path.with_suffix(".part")
+    temporary.write_text("".join(f"{line}\n" for line in kept))
+    temporary.replace(path)

@@ -35,6 +35,7 @@ class Stage:
     draws: int = 1  # noise levels per scene and step
     lora: bool = False  # add LoRA factors to what trains
     remat: str = "dots"  # what the transformer's backward pass recomputes: none, dots or full
+    crop: int | None = None  # side of random square crops (VAE stages)
     recon_shrink: int = 1  # divides the size at which the reconstruction works
 
 
@@ -108,11 +109,13 @@ _SCRATCH = OptimConfig(
 def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
     video = ViewConfig(targets=frames, ordered=True)
-    images, short = ViewConfig(targets=1), ViewConfig(targets=5, ordered=True)
+    images = ViewConfig(targets=1)
+    short, longer = (ViewConfig(targets=n, ordered=True) for n in (5, 9))
     views = ViewConfig(targets=8, near=0.5)
     stages = [
-        Stage("vae_images", "vae", "^vae/", 1500, 24, _SCRATCH, images),
-        Stage("vae_clips", "vae", "^vae/", 1500, 4, _SCRATCH, short),
+        Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
+        Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
+        Stage("vae_longer", "vae", "^vae/", 200, 2, _SCRATCH, longer, crop=64),
         Stage("recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2),
         Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
@@ -155,10 +158,21 @@ def stage_config(config: RoGeConfig, stage: Stage) -> RoGeConfig:
     )
 
 
-def stage_batch(pool, stage: Stage, config: RoGeConfig, seed: int, index: int) -> dict[str, np.ndarray]:
-    """Batch number `index` of a stage; a pure function of its arguments."""
-    batch = draw_batch(pool, seed, index, stage.batch, stage.views, scale_rule=config.scale_rule)
-    return {"target_rgb": batch["target_rgb"]} if stage.objective == "vae" else batch
+def stage_batch(
+    pool, stage: Stage, config: RoGeConfig, seed: int, index: int, rows=None
+) -> dict[str, np.ndarray]:
+    """Batch number `index` of a stage, or some rows of it; a pure function of its arguments."""
+    batch = draw_batch(
+        pool, seed, index, stage.batch, stage.views, scale_rule=config.scale_rule, rows=rows
+    )
+    if stage.objective != "vae":
+        return batch
+    clips = batch["target_rgb"]
+    if stage.crop is None:
+        return {"target_rgb": clips}
+    rng = np.random.default_rng([seed, index, 1])
+    top, left = (int(rng.integers(0, side - stage.crop + 1)) for side in clips.shape[2:4])
+    return {"target_rgb": clips[:, :, top : top + stage.crop, left : left + stage.crop]}
 
 
 def new_leaves(config: RoGeConfig, stage: Stage) -> Tree:

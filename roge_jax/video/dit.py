@@ -29,6 +29,7 @@ from ..core.layers import (
 )  # fmt: skip
 from ..core.params import Initialiser, Spec, Tree, normal, stack, zeros
 from ..core.rope import frequencies, rotate_pairs
+from ..core.sharding import by_heads, constrain
 
 Split = Literal["image_first", "text_last"]
 Remat = Literal["none", "full", "dots"]
@@ -212,18 +213,19 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
     q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
     k = split_heads(rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS), heads)
     v = split_heads(linear(p["v"], x), heads)
-    q, k = rotate_pairs(q, angles), rotate_pairs(k, angles)
-    return linear(p["o"], merge_heads(attention(q, k, v, dtype=p["q"]["kernel"].dtype)))
+    q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v)
+    y = merge_heads(attention(q, k, v, dtype=p["q"]["kernel"].dtype))
+    return linear(p["o"], constrain(y, ("tokens", None)))
 
 
 def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array:
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
     dtype = p["q"]["kernel"].dtype
     q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
-    y = attention(q, kv["k"], kv["v"], dtype=dtype)
+    y = attention(*by_heads(q, kv["k"], kv["v"]), dtype=dtype)
     if "k_img" in kv:
-        y = y + attention(q, kv["k_img"], kv["v_img"], dtype=dtype)
-    return linear(p["o"], merge_heads(y))
+        y = y + attention(*by_heads(q, kv["k_img"], kv["v_img"]), dtype=dtype)
+    return linear(p["o"], constrain(merge_heads(y), ("tokens", None)))
 
 
 def block(
@@ -271,8 +273,9 @@ def dit_blocks(
         p, kv = layer
         if rows is not None:
             kv = cross_kv(p, rows, cfg=cfg, split=split)
-        return block(p, x, e0, angles, kv, heads=cfg.heads), None
+        return constrain(block(p, x, e0, angles, kv, heads=cfg.heads), ("tokens", None)), None
 
+    x = constrain(x, ("tokens", None))
     x, _ = jax.lax.scan(rematerialise(step, remat), x, (p["blocks"], kv), unroll=unroll)
     return x
 

@@ -1,0 +1,102 @@
+"""Several processes, one program: joining them, and which scenes of a batch each one has to load.
+
+Every process runs the same program on the same arguments. Weights and noise come from seeds, so they agree; only the
+scenes of a batch differ: a process loads those that its own devices work on (`local_rows`).
+"""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from ..errors import UserError
+from .sharding import batch_sharding
+
+# Address of process 0, number of processes, own number: as set by hand, or by torchrun and its relatives.
+_BY_HAND = (
+    ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
+    ("MASTER_ADDR", "WORLD_SIZE", "RANK"),
+)
+# Launchers that JAX itself understands, by the variable that counts the processes.
+_LAUNCHERS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
+
+
+def launch_arguments(environment: Mapping[str, str]) -> dict[str, Any] | None:
+    """Arguments of `jax.distributed.initialize` for this environment; None: a single process.
+
+    Read in this order: JAX_COORDINATOR_ADDRESS (host:port), JAX_NUM_PROCESSES, JAX_PROCESS_ID; torchrun's
+    MASTER_ADDR, MASTER_PORT, WORLD_SIZE, RANK; a SLURM step or an Open MPI job of more than one task (no arguments
+    needed). Raises UserError if a set is incomplete or not made of numbers.
+    """
+    for names in _BY_HAND:
+        # RANK and WORLD_SIZE alone say nothing: other tools set them too.
+        if names[0] not in environment:
+            continue
+        missing = [name for name in names if name not in environment]
+        if missing:
+            raise UserError(
+                f"{names[0]} is set but {' and '.join(missing)} is not: set all of {', '.join(names)}, or none."
+            )
+        address, count, index = (environment[name] for name in names)
+        if not (count.isdecimal() and index.isdecimal() and int(index) < int(count)):
+            raise UserError(f"{names[1]}={count} and {names[2]}={index}: need a count, and an index below it.")
+        if int(count) == 1:
+            return None
+        if ":" not in address:
+            port = environment.get("MASTER_PORT", "")
+            if not port.isdecimal():
+                raise UserError(f"{names[0]}={address} has no port: write host:port, or set MASTER_PORT.")
+            address = f"{address}:{port}"
+        found = {"coordinator_address": address, "num_processes": int(count), "process_id": int(index)}
+        if names[0] == "MASTER_ADDR" and environment.get("LOCAL_WORLD_SIZE", "1") != "1":
+            found["local_device_ids"] = [int(environment["LOCAL_RANK"])]  # one process per device
+        return found
+    if any(int(environment.get(name, 1)) > 1 for name in _LAUNCHERS):
+        return {}
+    return None
+
+
+def maybe_initialise_distributed() -> int:
+    """Join the other processes of this run, if the environment says that there are any; the number of processes.
+
+    Call it before anything asks JAX for devices. A second call does nothing.
+    """
+    arguments = launch_arguments(os.environ)
+    if arguments is None:
+        return 1
+    if not jax.distributed.is_initialized():
+        jax.distributed.initialize(**arguments)
+    return jax.process_count()
+
+
+def is_main() -> bool:
+    """Whether this process writes logs and models."""
+    return jax.process_index() == 0
+
+
+def local_rows(mesh: Mesh | None, batch: int) -> np.ndarray:
+    """Sorted indices of the scenes of a batch that this process' devices work on. Processes may share scenes."""
+    if mesh is None:
+        return np.arange(batch)
+    indices = batch_sharding(mesh, batch).addressable_devices_indices_map((batch,))
+    return np.unique(np.concatenate([np.arange(batch)[index[0]] for index in indices.values()]))
+
+
+def global_batch(local: Mapping[str, np.ndarray], mesh: Mesh, batch: int) -> dict[str, jax.Array]:
+    """Arrays [batch, ...] over the mesh from this process' rows [len(local_rows), ...]."""
+    rows, sharding = local_rows(mesh, batch), batch_sharding(mesh, batch)
+
+    def leaf(name: str, x) -> jax.Array:
+        x = np.asarray(x)
+        assert len(x) == len(rows), f"{name}: {len(x)} rows of this process, expected {len(rows)} of {batch}"
+
+        def share(index):
+            own = np.searchsorted(rows, np.arange(batch)[index[0]])
+            return x[own][(slice(None), *index[1:])]
+
+        return jax.make_array_from_callback((batch, *x.shape[1:]), sharding, share)
+
+    return {name: leaf(name, x) for name, x in local.items()}

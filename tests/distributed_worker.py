@@ -1,0 +1,89 @@
+"""One process of the run in test_distributed.py: a linear model trained by the package's own loop.
+
+    python distributed_worker.py OUT DATA_WAYS FSDP_WAYS STEPS [--resume] [--die-after STEP]
+
+Joins the others through the environment, as any launcher would have it.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+BATCH = 8
+
+
+def batches(rows):
+    """Sample j of batch i is a function of (i, j) alone."""
+
+    def draw(i: int) -> dict:
+        rngs = [np.random.default_rng([7, i, j]) for j in rows]
+        x = np.stack([rng.normal(size=16) for rng in rngs]).astype(np.float32)
+        return {"x": x, "y": np.sin(x[:, :4])}
+
+    return draw
+
+
+def train(out: Path, data: int, fsdp: int, steps: int, *, resume: bool = False, die_after: int | None = None):
+    import jax
+    import jax.numpy as jnp
+
+    from roge_jax.core import sharding
+    from roge_jax.core.distributed import local_rows
+    from roge_jax.core.params import Spec, init
+    from roge_jax.training.loop import LoopConfig
+    from roge_jax.training.loop import train as train_loop
+    from roge_jax.training.optim import OptimConfig
+
+    mesh = sharding.make_mesh(data, fsdp, devices=jax.devices()[: data * fsdp])
+    specs = {"out": {"kernel": Spec((16, 4), ("embed", "mlp")), "bias": Spec((4,), ("mlp",))}}
+    frozen_specs = {"base": {"kernel": Spec((16, 16), ("embed", "mlp"))}}
+
+    def objective(trainable, frozen, batch, key):
+        x = batch["x"] + 0.1 * jax.random.normal(key, batch["x"].shape)
+        y = jnp.tanh(x @ frozen["base"]["kernel"]) @ trainable["out"]["kernel"]
+        loss = jnp.square(y + trainable["out"]["bias"][None] - batch["y"]).mean()
+        return loss, {}
+
+    done = 0
+
+    def evaluate(params):
+        nonlocal done
+        done += 1
+        if done == die_after:
+            os._exit(9)  # no good-bye to anybody, as when a machine is lost
+        return {}
+
+    return train_loop(
+        objective,
+        init(jax.random.key(0), specs),
+        init(jax.random.key(1), frozen_specs),
+        specs,
+        batches(local_rows(mesh, BATCH)),
+        optim=OptimConfig(learning_rate=0.01, ema=0.9, warmup=1),
+        loop=LoopConfig(steps=steps, log_every=1, save_every=3),
+        out=out,
+        resume=resume,
+        mesh=mesh,
+        frozen_specs=frozen_specs,
+        batch=BATCH,
+        evaluate=evaluate,
+        evaluate_every=1,
+    )
+
+
+if __name__ == "__main__":
+    from roge_jax.core.distributed import maybe_initialise_distributed
+
+    out, data, fsdp, steps = sys.argv[1:5]
+    options = sys.argv[5:]
+    maybe_initialise_distributed()
+    train(
+        Path(out),
+        int(data),
+        int(fsdp),
+        int(steps),
+        resume="--resume" in options,
+        die_after=int(options[-1]) if "--die-after" in options else None,
+    )
