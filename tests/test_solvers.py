@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import load_file
+from solver_walk import walk
 
 from roge_jax.errors import UserError
 from roge_jax.video import testbed
@@ -52,14 +53,29 @@ def test_trajectories_equal_the_official_samplers(case):
         told = timesteps(grid[:-1], truncate=case["solver"] != "euler") / 1000
     a, b, weight = CONFIG["toy"]["a"], CONFIG["toy"]["b"], TENSORS["in.W"]
 
+    @jax.jit
     def velocity(x, s):
         return jnp.tanh(jnp.einsum("oc,bc...->bo...", weight, x)) + a * s * x + b * s
 
-    x1 = jnp.asarray(TENSORS["in.x0"])
-    _, info = solve(tabulate(name, grid, evaluate_at=told), velocity, x1, keep_states=True)
+    x1, table = jnp.asarray(TENSORS["in.x0"]), tabulate(name, grid, evaluate_at=told)
+    states = [x1, *(x for _, _, x in iterate(table, velocity, x1))]
+    got = np.stack(states)[:, 0]
     want = TENSORS[f"out.{case['name']}.states"]
-    got = np.asarray(info.states[:, 0])
     assert np.linalg.norm(got - want) < 1e-6 * np.linalg.norm(want)  # float32 over 50 steps
+
+
+def test_states_kept_by_solve_are_those_of_each_step():
+    grid = schedule("shift", 5)
+    x1 = jnp.linspace(-1, 1, 4)
+    # the last step, 0.56 wide, is of third order; the others are of fourth
+    x0, info = solve("rk4", lambda x, s: x * s, x1, grid, keep_states=True)
+    assert info.states.shape == (6, 4)
+    np.testing.assert_array_equal(info.states[0], x1)
+    np.testing.assert_array_equal(info.states[-1], x0)
+    # x(sigma) = x1 exp((sigma^2 - 1) / 2)
+    exact = x1[None] * np.exp((grid**2 - 1) / 2)[:, None]
+    np.testing.assert_allclose(info.states[:-1], exact[:-1], rtol=0, atol=2e-5)
+    np.testing.assert_allclose(info.states[-1], exact[-1], rtol=0, atol=2e-3)
 
 
 # ---- orders ----------------------------------------------------------------------------------------
@@ -141,14 +157,6 @@ def test_adaptive_error_follows_its_tolerance(two_flows):
 # ---- properties of every table ------------------------------------------------------------------------
 
 
-def walk(table, field, x1):
-    """Run a table in NumPy, float64: the definition, without JAX."""
-    stored = table.begin[:, None] * x1
-    for sigma, mix in zip(table.sigma, table.mix, strict=True):
-        stored = mix @ np.vstack([stored, field(stored[0], sigma)])
-    return stored[0]
-
-
 grids = st.lists(st.floats(0.02, 0.98), min_size=1, max_size=7, unique=True).filter(
     lambda inner: np.diff(np.sort([0, *inner, 1])).min() > 0.01
 )
@@ -169,21 +177,6 @@ def test_every_method_is_exact_on_straight_lines_and_stays_inside(name, inner):
     ends = walk(table, lambda x, s: (x - target) / s, x1)
     if name != "rkc2":  # its stages leave the ray
         np.testing.assert_allclose(ends, target, atol=1e-9)
-
-
-@pytest.mark.parametrize("name", FIXED)
-def test_tables_run_as_defined(name):
-    problem = testbed.low_rank(4, 2, 0.3)
-    table = tabulate(name, schedule("shift", 6, shift=3.0))
-    x1 = np.linspace(-1, 1, 4)
-    with jax.enable_x64(True):
-        want = walk(table, lambda x, s: np.asarray(problem.velocity(jnp.asarray(x), s)), x1)
-        x0, info = solve(table, problem.velocity, jnp.asarray(x1))
-    np.testing.assert_allclose(x0, want, rtol=0, atol=1e-13)
-    assert int(info.evaluations) == len(table.sigma) == nfe(name, 6)
-    np.testing.assert_allclose(
-        run(table, problem.velocity, jnp.asarray(x1, jnp.float32)), want, rtol=0, atol=2e-5
-    )
 
 
 def test_cost_of_a_step_is_as_stated():
@@ -208,48 +201,65 @@ def test_state_is_float32_whatever_the_network_returns(name):
     assert seen == {(jnp.dtype("float32"), jnp.dtype("float32"))}
 
 
-@pytest.mark.parametrize("name", FIXED)
-def test_network_is_traced_once_for_all_grids_of_a_length(name):
-    traces = []
-
-    @jax.jit
-    def compiled(x, table):
-        def velocity(x, sigma):
-            traces.append(None)
-            return -x * sigma
-
-        return solve(table, velocity, x)[0]
-
-    for shift in (1.0, 3.0, 5.0):
-        compiled(jnp.ones(3), tabulate(name, schedule("shift", 5, shift=shift)))
-    assert compiled._cache_size() == 1
-    assert len(traces) <= 2  # abstract evaluation of the branch may look at it a second time
-
-
 # ---- failures ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", list(SOLVERS))
-def test_non_finite_velocity_stops_the_run_and_is_named(name):
+@pytest.mark.parametrize("name", FIXED)
+def test_compiled_loop_follows_the_table_is_traced_once_and_stops_at_a_nan(name):
+    problem, called, traces = testbed.low_rank(4, 2, 0.3), [], []
+
+    @jax.jit
+    def compiled(x, table, poisoned_below):
+        def velocity(x, sigma):
+            traces.append(None)
+            jax.debug.callback(lambda s: called.append(float(s)), sigma)
+            bad = (sigma < poisoned_below) & (jnp.arange(4) == 2)
+            return jnp.where(bad, jnp.nan, problem.velocity(x, sigma))
+
+        return solve(table, velocity, x)
+
+    x1 = np.linspace(-1, 1, 4)
+    for shift in (1.0, 3.0, 5.0):
+        table = tabulate(name, schedule("shift", 6, shift=shift))
+        x0, info = compiled(jnp.asarray(x1, jnp.float32), table, -1.0)
+        raise_if_failed(info)
+        with jax.enable_x64(True):
+            want = walk(table, lambda x, s: problem.velocity(jnp.asarray(x), s), x1)
+        np.testing.assert_allclose(x0, want, rtol=0, atol=2e-5)
+        assert int(info.evaluations) == len(table.sigma) == nfe(name, 6)
+    assert compiled._cache_size() == 1
+    assert len(traces) <= 2  # abstract evaluation of the branch may look at it a second time
+
+    jax.effects_barrier()
+    called.clear()
+    _, info = compiled(jnp.asarray(x1, jnp.float32), table, 0.8)
+    jax.effects_barrier()
+    check_named_failure(info, called, 0.8, 4)
+    step = int(info.step)
+    assert table.grid[step] + 1e-6 >= min(called) >= table.grid[step + 1] - 1e-6
+
+
+def check_named_failure(info, called, poisoned_below, size):
+    assert sum(s < poisoned_below for s in called) == 1  # the one that failed, and none after it
+    assert len(called) == int(info.evaluations)
+    with pytest.raises(SamplingError) as caught:
+        raise_if_failed(info)
+    message = str(caught.value)
+    assert "velocity" in message and f"1 of {size} numbers" in message
+    assert f"sigma {min(called):.6g}" in message and f"step {int(info.step)}" in message
+
+
+def test_adaptive_loop_stops_at_a_nan():
     called = []
 
     def velocity(x, sigma):
         jax.debug.callback(lambda s: called.append(float(s)), sigma)
         return jnp.where((sigma < 0.55) & (jnp.arange(6) == 2).reshape(2, 3), jnp.nan, 0.1 * x)
 
-    grid = schedule("graded", 8, power=1, sigma_min=0.1)
-    _, info = jax.jit(lambda x: solve(name, velocity, x, grid))(jnp.ones((2, 3)))
+    grid = np.array([1.0, 0.9, 0.1, 0.0])
+    _, info = jax.jit(lambda x: solve("bosh3", velocity, x, grid))(jnp.ones((2, 3)))
     jax.effects_barrier()
-    assert sum(s < 0.55 for s in called) == 1  # the one that failed; none after it
-    assert len(called) == int(info.evaluations)
-    with pytest.raises(SamplingError) as caught:
-        raise_if_failed(info)
-    message = str(caught.value)
-    assert "velocity" in message and "1 of 6 numbers" in message
-    assert f"sigma {min(called):.6g}" in message and f"step {int(info.step)}" in message
-    if name in FIXED:
-        step = int(info.step)
-        assert grid[step] + 1e-6 >= min(called) >= grid[step + 1] - 1e-6
+    check_named_failure(info, called, 0.55, 6)
 
 
 def test_overflowing_state_is_named():
@@ -304,29 +314,43 @@ def test_unknown_names_are_answered():
 # ---- holding a part of the state ---------------------------------------------------------------------
 
 
+KNOWN, NOISE, FIRST = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7]), np.arange(3) == 0
+
+
+def hold_first(x, sigma):
+    return jnp.where(FIRST, (1 - sigma) * KNOWN + sigma * NOISE, x)
+
+
 @pytest.mark.parametrize("name", list(SOLVERS))
 def test_projection_holds_known_slots_at_every_stage(name):
-    x0, noise = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.7])
-    first = np.arange(3) == 0
+    @jax.jit
+    def velocity(x, sigma):  # the others are drawn to slot 0, whose own velocity is nonsense
+        return jnp.where(FIRST, 7.0, x - x[0])
 
-    def project(x, sigma):  # slot 0 is known
-        return jnp.where(first, (1 - sigma) * x0 + sigma * noise, x)
-
-    def velocity(x, sigma):  # the others are drawn to it; its own velocity is nonsense
-        return jnp.where(first, 7.0, x - x[0])
-
-    def true(x, sigma):
-        return np.where(first, noise - x0, x - x[0])
+    def true(x, sigma):  # slot 0 moves on a straight line, which every method follows exactly
+        return np.where(FIRST, NOISE - KNOWN, x - x[0])
 
     grid = schedule("graded", 6, sigma_min=0.05)
     with jax.enable_x64(True):
-        got, info = solve(name, velocity, jnp.asarray(noise), grid, project=project)
-        raise_if_failed(info)
-        got = np.asarray(got)
-    assert got[0] == x0[0]
-    # the known slot's path is straight, so every method follows it by its true velocity
-    if name in FIXED:
-        np.testing.assert_allclose(got, walk(tabulate(name, grid), true, noise), atol=1e-12)
-    else:  # it chose its own steps for tolerance 1e-3
-        fine = walk(tabulate("rk4", schedule("uniform", 50)), true, noise)
-        np.testing.assert_allclose(got, fine, atol=3e-3)
+        if name in FIXED:
+            *_, (_, _, x0) = iterate(name, velocity, jnp.asarray(NOISE), grid, project=hold_first)
+            want, allowed = walk(tabulate(name, grid), true, NOISE), 1e-12
+        else:  # it chooses its own steps for tolerance 1e-3
+            x0, info = solve(name, velocity, jnp.asarray(NOISE), grid, project=hold_first)
+            raise_if_failed(info)
+            want, allowed = walk(tabulate("rk4", schedule("uniform", 50)), true, NOISE), 3e-3
+        got = np.asarray(x0)
+    assert got[0] == KNOWN[0]
+    np.testing.assert_allclose(got, want, atol=allowed)
+
+
+def test_projection_in_the_compiled_loop_equals_the_python_loop():
+    grid = schedule("graded", 6, sigma_min=0.05)
+
+    def velocity(x, sigma):
+        return jnp.where(FIRST, 7.0, x - x[0])
+
+    with jax.enable_x64(True):
+        x0, _ = solve("heun", velocity, jnp.asarray(NOISE), grid, project=hold_first)
+        *_, (_, _, want) = iterate("heun", velocity, jnp.asarray(NOISE), grid, project=hold_first)
+        np.testing.assert_allclose(x0, want, rtol=0, atol=1e-14)

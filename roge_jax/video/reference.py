@@ -87,12 +87,13 @@ def integrate(
     walk = _walker(velocity, stepper, tolerance, max_iterations)
     sigmas = check_grid(sigmas)
     inside = end_inside and sigmas[-1] == 0.0
-    capacity = max(64, 1 << (len(sigmas) - 2).bit_length())  # grids of many lengths, one compilation
-    return walk(x1, *_plan(sigmas, capacity, family, stages, inside))
+    return walk(x1, *_plan(sigmas, family, stages, inside))
 
 
-def _plan(sigmas: np.ndarray, capacity: int, family: str, stages: int, inside: bool):
-    """Grid padded to `capacity` steps, number of steps, and the tableaux of the steps and the last."""
+def _plan(sigmas: np.ndarray, family: str, stages: int, inside: bool):
+    """Grid, padded so that many lengths share a compilation, its steps, and the tableaux of the
+    steps and of the last one."""
+    capacity = max(512, 1 << (len(sigmas) - 2).bit_length())
     padded = np.append(sigmas, np.full(capacity + 1 - len(sigmas), sigmas[-1]))
     main, last = tableau(family, stages), tableau("gauss" if inside else family, stages)
     return padded, len(sigmas) - 1, main, last
@@ -215,7 +216,7 @@ def reference_solution(
         failed = []
 
         def run(label: str, grid: np.ndarray, family: str, s: int, failed=failed) -> Array:
-            plan = _plan(grid, len(grids[-1]) - 1, family, s, grid[-1] == 0.0)
+            plan = _plan(grid, family, s, grid[-1] == 0.0)
             x0, report = walk(x1, *plan)
             if int(report["failed"]):
                 i = int(report["first"])

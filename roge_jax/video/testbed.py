@@ -16,6 +16,7 @@ and initial-value problems for general integrator health, in time t = 1 - sigma:
 dahlquist, prothero_robinson, van_der_pol, hires.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -156,6 +157,7 @@ def conditional(matrix, observed, noise: float) -> Problem:
     return Problem("conditional", len(mean), turned(inner.velocity), turned(inner.exact))
 
 
+@functools.cache  # one object, so that solvers compiled for its field are found again
 def guided_mixture(
     scale: float, interval: tuple[float, float] = (0.0, 1.0), dim: int = 8, seed: int = 0
 ) -> Problem:
