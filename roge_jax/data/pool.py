@@ -119,7 +119,8 @@ def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int
     jobs = _missing(path, seeds, settings)
     # Threads lose on this work; one-thread processes scale. Workers read these when JAX starts.
     old = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
-    os.environ.update(_WORKER_ENVIRONMENT)
+    flags = f"{os.environ.get('XLA_FLAGS', '')} {_WORKER_ENVIRONMENT['XLA_FLAGS']}".strip()
+    os.environ.update(_WORKER_ENVIRONMENT | {"XLA_FLAGS": flags})  # the caller's flags stay
     try:
         # An executor and not a multiprocessing.Pool: a worker that dies raises, it never hangs.
         with concurrent.futures.ProcessPoolExecutor(
