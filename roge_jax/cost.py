@@ -168,15 +168,18 @@ def vae_decode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: b
                 total += clip._replace(frames=clip.frames - 1).conv(c, 2 * c, dense=dense, space=1)
                 clip = clip._replace(frames=2 * clip.frames - 1)
             clip = clip._replace(height=2 * clip.height, width=2 * clip.width)
-            total += clip.conv(c, c // 2, dense=dense, time=1)
+            total += clip.conv(c, c // 2, dense=dense, time=1, space=9 if dense else 4)  # see `vae.up_conv`
     return total + clip.conv(widths[-1], 3, dense=dense)
 
 
 def decoder_tensor_bytes(config: RoGeConfig, frames: int | None = None) -> float:
-    """The decoder's largest tensor, float32: after the last nearest-neighbour up-sampling, before its convolution."""
-    cfg = config.vae
-    widest = cfg.base * cfg.multipliers[min(1, len(cfg.multipliers) - 1)]
-    return 4.0 * (frames or config.frames) * config.height * config.width * widest
+    """The decoder's largest tensor, float32: a feature map of the last stage, at full size."""
+    return 4.0 * (frames or config.frames) * config.height * config.width * _widths(config.vae)[0]
+
+
+# Maps of full size alive at once in a residual block: its input, that activated, and of the convolution the sum over
+# past taps, the tap at work, its padded copy and the new sum.
+MAPS = 6
 
 
 # ---- a whole run ---------------------------------------------------------------------------------
@@ -188,14 +191,19 @@ def tokens_per_slot(config: RoGeConfig) -> int:
     return (lh // config.dit.patch) * (lw // config.dit.patch)
 
 
+def keeps_float32(path: str) -> bool:
+    """Whether a leaf stays float32 when the large matrices are bfloat16: the VAE, norms, modulation, time, head."""
+    return path.startswith("vae/") or bool(re.search(FLOAT32_LEAVES, path.removeprefix("dit/")))
+
+
 def weight_bytes(config: RoGeConfig, dtype: Any = jnp.float32) -> dict[str, float]:
     """Bytes of each part's weights when large matrices are `dtype`; the VAE and small leaves stay float32."""
     sizes: dict[str, float] = {}
     for path, spec in flatten(model.specs(config)).items():
         part = path.partition("/")[0]
-        full = part == "vae" or re.search(FLOAT32_LEAVES, path)
+        size = 4 if keeps_float32(path) else jnp.dtype(dtype).itemsize
         sizes.setdefault(part, 0.0)
-        sizes[part] += math.prod(spec.shape) * (4 if full else jnp.dtype(dtype).itemsize)
+        sizes[part] += math.prod(spec.shape) * size
     return sizes
 
 
@@ -225,9 +233,8 @@ def estimate(
 ) -> Estimate:
     """A window with m photos. `fused_attention`: scores are never stored (GPU, bfloat16).
 
-    Working memory counts the tensors that must live at the same time: scores and their exponentials, a block's
-    queries, keys, values and hidden layer, the convolution's input and output in the VAE. It is an estimate; what XLA
-    allocates lies within a factor of two of it.
+    Working memory counts the tensors that live at the same time: attention scores, a block's queries,
+    keys, values and hidden layer, the full-size maps of the VAE. XLA allocates within a factor of two of it on CPU.
     """
     n, slots = config.frames, config.slots(m)
     size = (config.recon_height, config.recon_width)
@@ -246,7 +253,7 @@ def estimate(
     }
 
     def scores(queries: float, keys: float, heads: int) -> float:
-        return 0.0 if fused_attention else 8.0 * queries * keys * heads
+        return 0.0 if fused_attention else 4.0 * queries * keys * heads
 
     e, r, d = config.encoder, config.renderer, config.dit
     chunk = min(r.chunk, m + n)
@@ -255,14 +262,14 @@ def estimate(
     features = 4.0 * (m + n) * rays * r.width
     chunked = decoder_tensor_bytes(config) > SINGLE_PASS_BYTES
     working = {
-        "encode photos (VAE)": 2 * decoder_tensor_bytes(config, m),
+        "encode photos (VAE)": MAPS * decoder_tensor_bytes(config, m),
         "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
         "query rays": features
         + chunk * scores(ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
         "velocity": features + scores(tokens, tokens, d.heads) + 4.0 * tokens * (6 * d.width + d.ffn),
-        "decode": 2 * decoder_tensor_bytes(config, 4 if chunked else n),
+        "decode": MAPS * decoder_tensor_bytes(config, 4 if chunked else n),
     }
     counts = {
         "scene tokens": scene_tokens,

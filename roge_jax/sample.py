@@ -181,14 +181,11 @@ def _option(word: str, trajectory: str) -> tuple[str, Any]:
 
 def load_weights(args: argparse.Namespace):
     """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
-    import re
-
     import jax
     import jax.numpy as jnp
 
-    from . import checkpoint, model
+    from . import checkpoint, cost, model
     from .core.params import count, flatten, unflatten
-    from .video.dit import FLOAT32_LEAVES
 
     dtype = args.dtype
     if dtype == "auto":
@@ -199,7 +196,7 @@ def load_weights(args: argparse.Namespace):
         flat = flatten(params)
         params = unflatten(
             {
-                path: leaf.astype(jnp.float32) if path.startswith("vae/") or re.search(FLOAT32_LEAVES, path) else leaf
+                path: leaf.astype(jnp.float32) if cost.keeps_float32(path) else leaf
                 for path, leaf in flat.items()
             }
         )

@@ -1,0 +1,445 @@
+"""Photos to video through the program itself, on the tiny model with random weights and a scene written here."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+from scene_files import nerfstudio, truth
+
+from roge_jax import checkpoint, entry, model, sample, sampling, video_io
+from roge_jax.config import preset
+from roge_jax.data.scene import load_scene
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import Cameras, normalise
+from roge_jax.geometry.trajectories import make_path
+
+CONFIG = preset("tiny")
+WINDOW = CONFIG.frames  # 5
+
+
+@pytest.fixture(scope="module")
+def weights():
+    params = model.init(jax.random.key(0), CONFIG)
+    rng = np.random.default_rng(0)
+
+    def fill(leaf):  # the published initialisation is zero here: nothing would depend on anything
+        return np.asarray(0.1 * rng.standard_normal(leaf.shape), np.float32)
+
+    params["dit"]["head"]["linear"]["kernel"] = fill(params["dit"]["head"]["linear"]["kernel"])
+    params["renderer"]["rgb_head"]["linear"]["kernel"] = fill(params["renderer"]["rgb_head"]["linear"]["kernel"])
+    for name in ("rays_embed", "geometry_embed"):
+        params["fusion"][name]["kernel"] = fill(params["fusion"][name]["kernel"])
+    return params
+
+
+@pytest.fixture(scope="module")
+def place(weights, tmp_path_factory):
+    """A folder with a model and a scene of four photos."""
+    folder = tmp_path_factory.mktemp("sample")
+    checkpoint.save_model(folder / "model", weights, CONFIG, dtype=np.float32)
+    nerfstudio(folder / "scene", truth(4))
+    return folder
+
+
+def program(place, *arguments, out="out"):
+    """The exit code of `python -m roge_jax.sample` with the tiny model and scene unless told otherwise."""
+    given = {"--checkpoint": place / "model", "--scene": place / "scene", "--out": place / out, "--steps": 2}
+    words = [str(word) for word in arguments]
+    defaults = [str(x) for name, value in given.items() if name not in words for x in (name, value)]
+    return entry.execute(sample.main, sample.parser(), defaults + words)
+
+
+# ---- the whole program ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def chain(place):
+    """Three windows: 12 frames of an orbit, chained."""
+    assert program(place, "--frames", 12, "--trajectory", "orbit:degrees=30", out="chain") == 0
+    return place / "chain"
+
+
+def test_all_files_are_there_and_no_other(chain):
+    names = sorted(p.name for p in chain.iterdir())
+    assert names == [
+        "contact_sheet.png",
+        "frames",
+        "preview.mp4",
+        "run.json",
+        "transforms.json",
+        "video.mp4",
+    ]
+    assert not list(chain.parent.glob("*.part"))
+
+
+def test_videos_and_frames_agree(chain):
+    from PIL import Image
+
+    frames = np.stack([np.asarray(Image.open(chain / "frames" / f"{i:04d}.png")) for i in range(12)])
+    assert len(list((chain / "frames").iterdir())) == 12
+    assert frames.shape == (12, CONFIG.height, CONFIG.width, 3)
+    for name in ("video.mp4", "preview.mp4"):
+        assert video_io.read_video(chain / name).shape == frames.shape
+    video = video_io.read_video(chain / "video.mp4")
+    # Noise-like pictures lose their colour resolution, but stay nearer to their own frame than to any other.
+    gaps = np.abs(video[:, None].astype(int) - frames[None]).mean((2, 3, 4))
+    own = np.diag(gaps)
+    different = np.abs(frames[:, None].astype(int) - frames[None]).mean((2, 3, 4)) > 10
+    assert (gaps > own[:, None])[different].all() and different.any()
+
+
+def test_transforms_are_the_path_in_the_scenes_own_frame(chain, place):
+    made = load_scene(chain)
+    assert len(made) == 12 and made.sizes == [(CONFIG.height, CONFIG.width)] * 12
+    scene = load_scene(place / "scene")
+    photos = sampling.read_photos(scene, [0, 1, 2, 3], CONFIG)
+    path = make_path("orbit", photos.cameras, 12, degrees=30)
+    np.testing.assert_allclose(made.cameras.c2w, path.c2w, atol=1e-12)
+    np.testing.assert_allclose(made.cameras.K, path.K, atol=1e-10)
+
+
+def test_record_says_what_was_made(chain, place):
+    run = json.loads((chain / "run.json").read_text())
+    assert run["frames"] == 12 and run["size"] == [CONFIG.height, CONFIG.width]
+    assert run["scene"]["context"] == [0, 1, 2, 3] and run["scene"]["context_names"][0] == "0000.png"
+    assert run["evaluations"] == 3 * 2
+    assert run["config"]["name"] == "tiny" and run["settings"]["seed"] == 0
+    assert run["versions"]["jax"] == jax.__version__ and run["device"]["backend"] == "cpu"
+    scene = load_scene(place / "scene")
+    _, _, info = normalise(scene.cameras, scene.cameras)
+    assert run["scale"]["divisor"] == pytest.approx(info.divisor)
+    assert set(run["stages"]) == {"load", "compile", "prepare", "sample", "decode", "write", "total"}
+    assert sum(s["seconds"] for n, s in run["stages"].items() if n != "total") <= run["stages"]["total"]["seconds"]
+    assert [w["frames"] for w in run["windows"]] == [[0, 4], [5, 9], [10, 11]]
+    assert run["windows"][0]["generated"] == [] and run["windows"][1]["generated"][0] == 4
+    assert run["windows"][2]["generated"][0] == 9
+
+
+def test_same_seed_same_bytes_from_one_photo(place, capsys):
+    def frames(out, seed):
+        assert program(place, "--frames", 3, "--context", "2,", "--seed", seed, out=out) == 0
+        return [p.read_bytes() for p in sorted((place / out / "frames").iterdir())]
+
+    first = frames("a", 5)
+    assert "one context view: the photos fix no scale" in capsys.readouterr().err
+    assert len(first) == 3
+    assert frames("b", 5) == first
+    other = frames("a", 6)  # the earlier run in the same folder is replaced
+    assert all(x != y for x, y in zip(first, other, strict=True))
+    run = json.loads((place / "a" / "run.json").read_text())
+    assert run["scene"]["context"] == [2] and run["scale"]["status"] == "single_view"
+
+
+# ---- windows -------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def photos(place):
+    return sampling.read_photos(load_scene(place / "scene"), [0, 1, 2, 3], CONFIG)
+
+
+SETTINGS = sampling.Settings(steps=2, solver="euler")
+
+
+def test_a_padded_path_gives_the_frames_of_the_longer_one(weights, photos):
+    path = make_path("move-right", photos.cameras, WINDOW)
+    cache = {}
+    whole = sampling.sample(weights, CONFIG, photos, path, SETTINGS, cache=cache)
+    short = sampling.sample(weights, CONFIG, photos, path[:3], SETTINGS, cache=cache)
+    assert short.frames.shape == (3, CONFIG.height, CONFIG.width, 3) and len(cache) == 1
+    # A straight path goes on as padding does, so that both windows differ by the rounding of poses alone.
+    np.testing.assert_allclose(short.frames, whole.frames[:3], atol=1e-3)
+    np.testing.assert_allclose(short.preview, whole.preview[:3], atol=1e-3)
+    np.testing.assert_array_equal(short.cameras.c2w, path.c2w[:3])
+
+
+def test_independent_windows_see_the_photos_alone_and_compile_once(weights, photos):
+    path = make_path("orbit", photos.cameras, 2 * WINDOW)
+    cache = {}
+    settings = sampling.Settings(steps=2, solver="euler", long="independent")
+    result = sampling.sample(weights, CONFIG, photos, path, settings, cache=cache)
+    assert list(cache) == [4]
+    assert all(w["generated"] == [] and w["photos"] == [0, 1, 2, 3] for w in result.windows)
+    # The preview has no noise: it must be that of the second half alone, in the world of the whole path.
+    half = sampling.sample(weights, CONFIG, photos, path[WINDOW:], settings, cache=cache)
+    np.testing.assert_allclose(result.preview[WINDOW:], half.preview, atol=1e-5)
+    assert np.abs(result.frames[WINDOW:] - half.frames).mean() > 0.01  # windows draw noise of their own
+
+
+def test_chained_windows_share_one_compilation_and_remember(weights, photos):
+    path = make_path("orbit", photos.cameras, 3 * WINDOW)
+    cache = {}
+    result = sampling.sample(weights, CONFIG, photos, path, SETTINGS, cache=cache)
+    assert list(cache) == [4, 4 + sampling.CHAIN_FRAMES]
+    alone = sampling.Settings(steps=2, solver="euler", long="independent")
+    other = sampling.sample(weights, CONFIG, photos, path, alone, cache=cache)
+    np.testing.assert_array_equal(result.frames[:WINDOW], other.frames[:WINDOW])
+    assert np.abs(result.preview[WINDOW:] - other.preview[WINDOW:]).max() > 1e-4
+
+
+def test_program_agrees_with_the_model_file(weights, photos):
+    """One window of the sampler is `model.prepare`, `generate` and `decode_video` on the same noise."""
+    path = make_path("orbit", photos.cameras, WINDOW)
+    ours = sampling.sample(weights, CONFIG, photos, path, SETTINGS)
+    context, target, info = normalise(photos.cameras, path)
+    views = sampling.window_views(photos.images, None, context, target, info, CONFIG)
+    noise = sampling.draw_noise(0, 0, 4, CONFIG)
+    grid = sampling.flow.schedule("shift", 2)
+
+    @jax.jit
+    def plain(params, views, noise):
+        prepared = model.prepare(params, views, config=CONFIG)
+        latents, _ = model.generate(params, prepared, noise, config=CONFIG, solver="euler", sigmas=grid)
+        return model.decode_video(params, latents, config=CONFIG)
+
+    np.testing.assert_allclose(ours.frames, plain(weights, views, noise), atol=2e-4)
+
+
+class TestChaining:
+    def cameras(self, x):
+        c2w = np.tile(np.eye(4), (len(x), 1, 1))
+        c2w[:, 0, 3] = x
+        return Cameras(np.tile(np.diag([50.0, 50.0, 1.0]), (len(x), 1, 1)), c2w)
+
+    def config(self, most):
+        import dataclasses
+
+        return dataclasses.replace(CONFIG, max_context=most)
+
+    @pytest.mark.parametrize("m", range(1, 7))
+    @pytest.mark.parametrize("most", [2, 3, 6])
+    def test_never_more_than_the_model_takes(self, m, most):
+        if m > most:
+            pytest.skip("more photos than the model takes are refused before")
+        photos, made = sampling.chained(m, self.config(most))
+        assert 1 <= photos <= m and 1 <= made <= sampling.CHAIN_FRAMES and photos + made <= most
+
+    def test_one_context_leaves_no_room(self):
+        assert sampling.chained(1, self.config(1)) == (1, 0)
+
+    def test_last_frame_and_world_frame_always_stay(self):
+        photos, made = self.cameras([100.0, 3.0, 9.0, 1.0]), self.cameras([0.0, 1.0, 2.0, 2.5])
+        kept, chosen = sampling.chain_views(photos, made, self.cameras([3.0, 4.0]), self.config(4))
+        # Three photos fit beside one frame: the first although it is far away, and the two nearest ones.
+        assert kept == [0, 1, 3] and chosen == [3]
+
+    def test_a_path_that_returns_sees_what_it_saw_there(self):
+        made = self.cameras(np.linspace(0, 10, 11))
+        kept, chosen = sampling.chain_views(self.cameras([50.0]), made, self.cameras([0.1, 0.2, 1.9]), self.config(6))
+        assert kept == [0]
+        assert chosen[0] == 10 and chosen[1] in (0, 1)
+
+    def test_windows_cover_the_path_once(self):
+        for frames in (1, 5, 6, 12, 15):
+            runs = sampling.windows(frames, 5)
+            assert [i for a, b in runs for i in range(a, b)] == list(range(frames))
+
+    def test_turning_counts_as_distance(self):
+        a, b = self.cameras([0.0]), self.cameras([0.0])
+        angle = 0.3
+        b.c2w[0, :3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        assert sampling.view_distance(a, b)[0, 0] == pytest.approx(angle)
+
+
+def test_noise_depends_on_seed_and_window_alone():
+    draw = [sampling.draw_noise(seed, window, 2, CONFIG) for seed, window in ((0, 0), (0, 1), (1, 0), (0, 0))]
+    assert draw[0].dtype == np.float32 and draw[0].shape == (4, 4, 6, 16)
+    np.testing.assert_array_equal(draw[0], draw[3])
+    assert abs(np.corrcoef(draw[0].ravel(), draw[1].ravel())[0, 1]) < 0.1
+    assert abs(np.corrcoef(draw[0].ravel(), draw[2].ravel())[0, 1]) < 0.1
+
+
+def test_photos_at_reconstruction_size_are_sharper_than_a_resize(place):
+    import dataclasses
+
+    scene = load_scene(place / "scene")
+    double = dataclasses.replace(CONFIG, recon_height=64, recon_width=96)
+    photos = sampling.read_photos(scene, [0, 1], double)
+    assert photos.recon.shape == (2, 64, 96, 3)
+    # The picture is a ramp: both sizes show the same window of it.
+    np.testing.assert_allclose(
+        photos.recon.reshape(2, 32, 2, 48, 2, 3).mean((2, 4)), photos.images, atol=0.02
+    )
+    assert sampling.read_photos(scene, [0], CONFIG).recon is None
+
+
+def test_identical_photos_count_once(place):
+    scene = load_scene(place / "scene")
+    with pytest.warns(UserWarning, match="same pose and picture"):
+        photos = sampling.read_photos(scene, [1, 0, 1], CONFIG)
+    assert photos.ids == (1, 0) and len(photos.images) == len(photos.cameras) == 2
+
+
+# ---- options -------------------------------------------------------------------------------------
+
+
+def arguments(*words):
+    return entry.parse(sample.parser(), [str(word) for word in words])
+
+
+def test_defaults_are_the_contract():
+    args = arguments()
+    assert (args.checkpoint, args.scene, args.trajectory) == ("mini", "motorcycle", "orbit")
+    assert (args.long, args.context_slots, args.fps, args.seed) == ("chain", "noised", 16.0, 0)
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"),
+    [(None, [0, 1, 2, 3]), ("4", [0, 1, 2, 3]), ("3,1", [3, 1]), ("2,", [2]), ("0003.png,0", [3, 0])],
+)
+def test_context_words(text, ids, place):
+    assert sample.context_ids(text, load_scene(place / "scene"), 9) == ids
+
+
+def test_field_of_view_and_size(place, photos):
+    args = arguments("--fov", 90, "--frames", 4)
+    path = sample.camera_path(args, photos.cameras, CONFIG)
+    np.testing.assert_allclose(path.K[3], [[16, 0, 24], [0, 16, 16], [0, 0, 1]], atol=1e-12)
+    config = sample.model_config(arguments("--checkpoint", place / "model", "--size", "48x64"), weights=True)
+    assert (config.height, config.width, config.recon_height, config.recon_width) == (48, 64, 48, 64)
+
+
+def test_path_files_are_followed(tmp_path, photos):
+    from roge_jax.geometry.paths import save_path
+
+    path = make_path("spiral", photos.cameras, 7)
+    save_path(tmp_path / "path.json", path, CONFIG.height, CONFIG.width)
+    found = sample.camera_path(arguments("--trajectory", tmp_path / "path.json"), photos.cameras, CONFIG)
+    np.testing.assert_allclose(found.c2w, path.c2w, atol=1e-12)
+
+
+# ---- dry run -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("tiny", "32x48"), ("mini", "64x112"), ("wan1.3b", "5,796 transformer tokens"), ("paper", "1,554 scene tokens")],
+)
+def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
+    assert entry.execute(sample.main, sample.parser(), ["--checkpoint", name, "--context", "2", "--dry-run", "--out", str(tmp_path / "o")]) == 0
+    shown = capsys.readouterr().out
+    assert said in shown and "velocity x 12" in shown and "peak memory" in shown
+    assert not any(tmp_path.iterdir())
+
+
+def test_dry_run_counts_windows(place, capsys):
+    assert program(place, "--dry-run", "--frames", 12, "--context", 3, out="dry") == 0
+    shown = capsys.readouterr().out
+    assert "3 windows of 5" in shown and "3, then 5 with frames already made" in shown
+    assert not (place / "dry").exists()
+
+
+# ---- bad input -----------------------------------------------------------------------------------
+
+
+def broken_scene(place, name, change):
+    return nerfstudio(place / name, truth(2), change={1: change})
+
+
+BAD = {
+    "unknown trajectory": (["--trajectory", "orbti"], "did you mean 'orbit'?"),
+    "unknown trajectory option": (["--trajectory", "orbit:degres=3"], "did you mean 'degrees'?"),
+    "malformed trajectory option": (["--trajectory", "orbit:30"], "'30' is no option"),
+    "missing path file": (["--trajectory", "gone.json"], "gone.json: cannot read the path file"),
+    "unknown checkpoint": (["--checkpoint", "mnii"], "Unknown checkpoint 'mnii'"),
+    "preset without weights": (["--checkpoint", "wan1.3b"], "No trained weights of preset 'wan1.3b'"),
+    "unknown scene": (["--scene", "motorcicle"], "did you mean 'motorcycle'?"),
+    "missing scene": (["--scene", "no/such/folder"], "no/such/folder"),
+    "too many photos": (["--context", "5"], "--context 5: give 1 to 4"),
+    "no photos": (["--context", "0"], "--context 0: give 1 to 4"),
+    "unknown photo": (["--context", "0,7"], "there is no photo 7"),
+    "unknown photo name": (["--context", "0,0001.pgn"], "did you mean '0001.png'?"),
+    "no frames": (["--frames", "0"], "'0' is not a whole number of at least 1"),
+    "no steps": (["--steps", "0"], "'0' is not a whole number of at least 1"),
+    "unknown solver": (["--solver", "eulr"], "did you mean 'euler'?"),
+    "unknown schedule": (["--schedule", "shfit"], "did you mean 'shift'?"),
+    "unknown way to chain": (["--long", "chained"], "did you mean 'chain'?"),
+    "unknown option": (["--trajectry", "orbit"], "did you mean '--trajectory'?"),
+    "size that does not fit": (["--size", "30x48"], "must be multiples of 16"),
+    "size that is none": (["--size", "large"], "'large' is not HEIGHTxWIDTH"),
+    "impossible field of view": (["--fov", "180"], "between 0 and 180"),
+    "start that is no photo": (["--start", "4"], "start=4 is no context view"),
+    "no optimised schedule": (["--schedule", "optimised", "--steps", "777"], "No optimised schedule"),
+}
+
+
+def expect_refusal(code, said, place, capsys, out="bad"):
+    shown = capsys.readouterr().err
+    assert code == 2, shown
+    assert said in shown
+    assert shown.startswith("error: ") and shown.count("\n") == 1 and "Traceback" not in shown
+    assert not (place / out).exists() and not (place / f"{out}.part").exists()
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_options_are_refused_in_one_sentence(case, place, capsys):
+    words, said = BAD[case]
+    expect_refusal(program(place, *words, out="bad"), said, place, capsys)
+
+
+NAN_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, float("nan")], [0, 0, 0, 1]]
+MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"file_path": "images/gone.png"}, "gone.png"),
+        ({"transform_matrix": NAN_POSE}, "0001"),
+        ({"transform_matrix": MIRROR}, "mirror"),
+        ({"fl_x": -5.0}, "0001"),
+        ({"w": 80, "h": 24}, "intrinsics are for"),
+    ],
+)
+def test_bad_scenes_are_refused_in_one_sentence(change, said, place, capsys, tmp_path):
+    scene = broken_scene(tmp_path, "scene", change)
+    expect_refusal(program(place, "--scene", scene, out="bad"), said, place, capsys)
+
+
+def test_torn_photo_is_named(place, capsys, tmp_path):
+    scene = nerfstudio(tmp_path / "scene", truth(2))
+    file = scene / "images" / "0001.png"
+    file.write_bytes(file.read_bytes()[:200])
+    expect_refusal(program(place, "--scene", scene, out="bad"), "0001.png", place, capsys)
+
+
+def test_torn_and_foreign_checkpoints_are_named(place, capsys, tmp_path):
+    import shutil
+
+    torn = tmp_path / "torn"
+    shutil.copytree(place / "model", torn)
+    file = next(torn.glob("*.safetensors"))
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    expect_refusal(program(place, "--checkpoint", torn, out="bad"), "truncated", place, capsys)
+    file.unlink()
+    expect_refusal(program(place, "--checkpoint", torn, out="bad"), "incomplete", place, capsys)
+    other = tmp_path / "other"
+    shutil.copytree(place / "model", other)
+    record = json.loads((other / "config.json").read_text())
+    record["config"]["dit"]["width"] = 128
+    (other / "config.json").write_text(json.dumps(record))
+    expect_refusal(program(place, "--checkpoint", other, out="bad"), "does not fit", place, capsys)
+
+
+def test_foreign_folders_are_not_overwritten(place, capsys):
+    (place / "mine").mkdir()
+    (place / "mine" / "thesis.tex").write_text("precious")
+    assert program(place, out="mine") == 2
+    assert "not of an earlier run" in capsys.readouterr().err
+    assert (place / "mine" / "thesis.tex").read_text() == "precious"
+
+
+def test_a_network_that_breaks_stops_with_the_step_and_leaves_nothing(place, weights, capsys, tmp_path):
+    broken = jax.tree.map(np.asarray, weights)
+    broken["dit"]["head"]["linear"]["bias"] = np.full_like(broken["dit"]["head"]["linear"]["bias"], np.nan)
+    checkpoint.save_model(tmp_path / "nan", broken, CONFIG, dtype=np.float32)
+    code = program(place, "--checkpoint", tmp_path / "nan", "--context", "2,", "--frames", 3, out="bad")
+    shown = capsys.readouterr().err
+    assert code == 1 and "error: The velocity (the network's output) is not finite at step 0" in shown
+    assert not (place / "bad").exists() and not (place / "bad.part").exists()
+
+
+def test_settings_name_the_closest_word():
+    with pytest.raises(UserError, match="did you mean 'clean'"):
+        sampling.Settings(slots="claen")
