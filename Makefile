@@ -1,0 +1,77 @@
+# Every target makes the virtual environment it needs. `make help` lists them; ARGS="..." is passed on.
+
+PYTHON ?= $(firstword $(foreach v,python3.13 python3.12 python3.11 python3,$(shell command -v $(v) 2>/dev/null)))
+VENV := .venv
+RUN := $(VENV)/bin/python
+BASE := $(VENV)/.base
+DEV := $(VENV)/.dev
+PARITY := $(VENV)/.parity
+PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal -q
+
+.DEFAULT_GOAL := help
+.PHONY: help sample train evaluate smoke test test-slow test-parity check lint format figures notebook clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+sample: $(BASE)  ## two real photos in, the video along a path out (outputs/sample)
+	$(RUN) -m roge_jax.sample --out outputs/sample $(ARGS)
+
+train: $(BASE)  ## train the shipped model further, end to end, into a new folder under runs/
+	$(RUN) -m roge_jax.train mini --out runs/$(shell date +%Y%m%d-%H%M%S) $(ARGS)
+
+evaluate: $(BASE)  ## the shipped model beside its baselines on held-out scenes
+	$(RUN) -m roge_jax.evaluate --scenes procedural:1000000000..1000000009 --out outputs/results.json $(ARGS)
+
+smoke: $(BASE)  ## both programs on tiny sizes and random weights
+	$(RUN) -m roge_jax.train tiny --steps 2 --out runs/smoke-$(shell date +%Y%m%d-%H%M%S)
+	$(RUN) -m roge_jax.sample --dry-run $(ARGS)
+
+test: $(DEV)  ## the fast tests
+	$(PYTEST) $(ARGS)
+
+test-slow: $(DEV)  ## tests that take minutes or gigabytes
+	$(RUN) -m pytest -q -m slow $(ARGS)
+
+test-parity: $(PARITY)  ## tests against PyTorch implementations (installs torch and diffusers)
+	$(RUN) -m pytest -q -m parity $(ARGS)
+
+check: lint test  ## what CI runs
+
+lint: $(DEV)  ## ruff and mypy, nothing is changed
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/mypy
+
+format: $(DEV)  ## let ruff order imports and lay out the code
+	$(VENV)/bin/ruff check --fix .
+	$(VENV)/bin/ruff format .
+
+figures: $(DEV)  ## every experiment again; writes experiments/results (long)
+	@for f in experiments/*.py; do echo "== $$f"; $(RUN) $$f || exit 1; done
+
+notebook: $(DEV)  ## run the notebook; the executed copy is outputs/from_rays_to_video.ipynb
+	@mkdir -p outputs
+	$(VENV)/bin/jupytext --to ipynb --execute --output outputs/from_rays_to_video.ipynb \
+		notebooks/from_rays_to_video.py
+
+clean:  ## remove caches (not runs, outputs or the environment)
+	rm -rf .jax_cache .pytest_cache .ruff_cache .mypy_cache .hypothesis
+
+$(VENV)/bin/python:
+	@test -n "$(PYTHON)" || { echo "No Python found: install Python 3.11 or newer."; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "$(PYTHON) is older than 3.11: use make PYTHON=/path/to/python3.11"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(BASE): pyproject.toml | $(VENV)/bin/python
+	$(RUN) -m pip install --quiet --editable .
+	@touch $@
+
+$(DEV): pyproject.toml | $(VENV)/bin/python
+	$(RUN) -m pip install --quiet --editable '.[dev]'
+	@touch $@ $(BASE)
+
+$(PARITY): pyproject.toml | $(VENV)/bin/python
+	$(RUN) -m pip install --quiet --editable '.[dev,parity]'
+	@touch $@ $(DEV) $(BASE)

@@ -1,0 +1,157 @@
+"""The house plan: who may import whom, what may be imported at all, and that importing the package costs nothing."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parent.parent / "roge_jax"
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+# One way only. What a unit (a top-level module or folder) may import of the package, itself apart.
+_GROUND = {"errors"}
+_BASE = _GROUND | {"core", "geometry", "config"}
+_PARTS = _BASE | {"recon", "video", "fusion"}
+ALLOWED = {
+    "errors": set(),
+    "core": _GROUND,  # knows nothing of RoGe
+    "geometry": _GROUND,
+    "config": _GROUND,
+    "recon": _BASE,  # the three networks do not know one another
+    "video": _BASE,
+    "fusion": _BASE,
+    "model": _PARTS,
+    "weights": _PARTS,
+    "data": _BASE,  # neither networks nor metrics
+    "metrics": _BASE,
+    "checkpoint": _PARTS | {"model", "weights"},
+    "cost": _PARTS | {"model"},
+    "training": _PARTS | {"model", "weights", "data", "metrics", "checkpoint"},
+    "sampling": _PARTS | {"model", "data", "cost"},
+}
+# Programs and their helpers may import anything but other programs.
+PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "view", "check"}
+LIGHT = {
+    "jax",
+    "ml_dtypes",
+    "numpy",
+    "flax",
+    "optimistix",
+    "optax",
+    "safetensors",
+    "tqdm",
+    "roge_jax",
+}
+
+
+def unit(path: Path) -> str:
+    """The folder or module directly under the package that a file belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(path: Path) -> list[tuple[str, int, bool]]:
+    """(absolute dotted name, line, whether it runs when the module is imported) of every import of a file."""
+    tree = ast.parse(path.read_text())
+    late = {
+        id(node)
+        for function in ast.walk(tree)
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+    }
+    package = ["roge_jax", *path.relative_to(PACKAGE).parts[:-1]]
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            lead = package[: len(package) - node.level + 1] if node.level else []
+            base = ".".join([*lead, *([node.module] if node.module else [])])
+            whole = base == "roge_jax"  # `from . import model` names modules
+            names = [f"{base}.{alias.name}" if whole else base for alias in node.names]
+        else:
+            continue
+        found += [(name, node.lineno, id(node) not in late) for name in names]
+    return found
+
+
+def internal(path: Path):
+    """(unit, line) of every import from the package, wherever it stands."""
+    for name, line, _ in imports(path):
+        first, *rest = name.split(".")
+        if first == "roge_jax" and rest:
+            yield rest[0], line
+
+
+def test_imports_point_one_way():
+    faults = []
+    for path in FILES:
+        mine = unit(path)
+        for other, line in internal(path):
+            bad = other in PROGRAMS or (mine in ALLOWED and other not in ALLOWED[mine])
+            if bad and other != mine:
+                faults.append(f"{path.relative_to(PACKAGE)}:{line} imports {other}")
+    assert not faults, "\n".join(faults)
+
+
+def test_the_plan_names_every_unit():
+    """A new module has to be placed: below in the table, or among the programs and their helpers."""
+    units = {unit(path) for path in FILES} - {"__init__", "assets"}
+    assert units <= set(ALLOWED) | PROGRAMS | {"entry", "video_io"}
+    assert set(ALLOWED) <= units
+
+
+def test_heavy_packages_are_imported_where_they_are_used():
+    faults = []
+    for path in FILES:
+        for name, line, at_import in imports(path):
+            first = name.split(".")[0]
+            if at_import and first not in LIGHT and first not in sys.stdlib_module_names:
+                faults.append(f"{path.relative_to(PACKAGE)}:{line} imports {name} at its top")
+    assert not faults, "\n".join(faults)
+
+
+def test_the_rules_see_what_they_should(tmp_path, monkeypatch):
+    """Against a test that cannot fail: a made-up package that breaks each rule."""
+    package = tmp_path / "roge_jax"
+    (package / "core").mkdir(parents=True)
+    file = package / "core" / "bad.py"
+    file.write_text(
+        "from ..model import loss\nfrom . import params\nfrom .. import video\nimport cv2\n\n\n"
+        "def f():\n    import scipy\n    from roge_jax.train import main\n"
+    )
+    monkeypatch.setitem(globals(), "PACKAGE", package)
+    assert set(internal(file)) == {("model", 1), ("core", 2), ("video", 3), ("train", 9)}
+    assert [(name, top) for name, _, top in imports(file)][3:] == [
+        ("cv2", True),
+        ("scipy", False),
+        ("roge_jax.train", False),
+    ]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_files_keep_to_one_subject(path):
+    text = path.read_text()
+    assert len(text.splitlines()) <= 440, "split it: a file this long has two subjects"
+    assert "from __future__ import annotations" not in text
+    assert path.name != "utils.py"
+
+
+def test_importing_the_package_is_free():
+    code = (
+        "import sys, time; t = time.process_time(); import roge_jax; t = time.process_time() - t; "
+        "assert t < 1.0, t; assert 'jax' not in sys.modules; print(sorted(dir(roge_jax)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "load" in done.stdout
+
+
+def test_the_public_names_exist():
+    import roge_jax
+
+    for name in roge_jax.__all__:
+        assert getattr(roge_jax, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = roge_jax.nothing
