@@ -177,7 +177,8 @@ def train(
     says (frozen ones on every device without `frozen_specs`). In a run of several processes `batches(i)` returns this
     process' `core.distributed.local_rows` of the `batch` scenes; the main process writes the log.
 
-    `evaluate(params)` of the averaged parameters is logged every `evaluate_every` steps and stops the run when it is not finite.
+    `evaluate(params)` of the averaged parameters is logged every `evaluate_every` steps and stops the run when it is
+    not finite.
     `diagnose(params, frozen, batch, key)` (see `training.diagnose`) is logged every `diagnose_every` steps. `writer`
     has TensorBoard's `add_scalar`.
 
@@ -202,6 +203,7 @@ def train(
         if is_main():
             log_path.unlink(missing_ok=True)
     elif resume:
+        _check_fits(checkpoints.folder, checkpoints.latest(), state)
         state = checkpoints.restore(state)
         if is_main():
             _cut_log(log_path, int(state["step"]))
@@ -255,12 +257,34 @@ def train(
                 terms, logged, started = [], done, time.perf_counter()
             if reason is not None:
                 last = checkpoints.latest()
-                where = f"step {last} in {checkpoints.folder}" if last else "none: it ended before the first"
-                raise TrainingStopped(f"Stopped at step {done}: {reason}. The last good checkpoint is {where}.")
+                good = f"step {last} in {checkpoints.folder}" if last else "none: it ended before the first"
+                raise TrainingStopped(f"Stopped at step {done}: {reason}. The last good checkpoint is {good}.")
             suspect = detector.beyond > 0 and done < loop.steps  # do not push good checkpoints out
             if due(loop.save_every) and not suspect:
                 checkpoints.save(done, state)
     return state
+
+
+def _check_fits(folder: Path, step: int, state: Tree) -> None:
+    """Raise `UserError` unless the checkpoint has the leaves of `state`.
+
+    Before any value is read: a restore that fails halfway leaves threads of Orbax behind that complain later.
+    """
+    import orbax.checkpoint as ocp
+
+    def shapes(tree) -> dict[str, tuple[int, ...]]:
+        leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+        return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(x.shape) for path, x in leaves}
+
+    want = shapes(state)
+    have = shapes(ocp.StandardCheckpointHandler().metadata(folder / str(step) / "default").tree)
+    wrong = sorted(path for path in have.keys() | want.keys() if have.get(path) != want.get(path))
+    if wrong:
+        raise UserError(
+            f"The checkpoint of step {step} in {folder} was written by another model or stage: {len(wrong)} of "
+            f"{len(want)} leaves differ, such as {wrong[0]} (there {have.get(wrong[0], 'missing')}, here "
+            f"{want.get(wrong[0], 'missing')}). Resume with the same preset and stage, or start in an empty folder."
+        )
 
 
 def _finite(values: dict) -> dict:

@@ -9,7 +9,12 @@ import optax
 
 from ..core.params import Spec, flatten, unflatten
 
-ADAM_ONLY = r"patch_embed|ray_embed|rgb_head|camera_mlp/fc1|time_embed|text_embed|head|e_rays|e_geom|conv_in|conv_out"
+# Kernels between the outside (pixels, rays, noise levels, words) and the hidden width keep Adam; Muon is for hidden
+# matrices, where every direction should move alike.
+ADAM_ONLY = (
+    r"patch_embed|rays?_embed|geometry_embed|time_embed|text_embed|clip_embed|camera_mlp/fc1"
+    r"|head/|conv_in|conv_out"
+)
 
 
 @dataclass(frozen=True)
