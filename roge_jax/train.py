@@ -9,6 +9,7 @@ Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) a
 """
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import math
@@ -46,6 +47,11 @@ def parser() -> argparse.ArgumentParser:
         "--mesh",
         help="how to split the work, e.g. data=2,fsdp=2,seq=2: scenes, weights, tokens and views of a\n"
         "scene (default: all devices on data); see docs/scaling.md, also for several machines",
+    )
+    p.add_argument(
+        "--frozen-dtype",
+        choices=("float32", "bfloat16"),
+        help="of weights that do not train (default: bfloat16 on accelerators, float32 on a CPU)",
     )
     p.add_argument("--show-mesh", action="store_true", help="print where every leaf lies, then train")
     p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
@@ -85,19 +91,21 @@ def main(args: argparse.Namespace) -> None:
 
     distributed.maybe_initialise_distributed()
     devices = jax.devices()[: args.devices] if args.devices else jax.devices()
-    mesh = sharding.make_mesh(**sizes, devices=devices) if len(devices) > 1 or sizes else None
+    plain = len(devices) == 1 and not sizes and devices[0].platform == "cpu"
+    mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
     from . import checkpoint, config
     from .training import stages as stages_
 
     preset = config.preset(args.preset)
     init = args.init or ("mini" if args.preset == "mini" and args.stage != "all" else "scratch")
-    if init == "scratch":
-        from . import model
+    with on_host():
+        if init == "scratch":
+            from . import model
 
-        params, cfg = model.init(jax.random.key(args.seed), preset), preset
-    else:
-        params, cfg = checkpoint.load_model(init)
+            params, cfg = model.init(jax.random.key(args.seed), preset), preset
+        else:
+            params, cfg = checkpoint.load_model(init)
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames)
     if args.stage == "all":
         chosen = recipe
@@ -129,6 +137,28 @@ def resize(cfg, size: str | None):
         recon_height=height * cfg.recon_height // cfg.height // 8 * 8,
         recon_width=width * cfg.recon_width // cfg.width // 8 * 8,
     )
+
+
+def on_host():
+    """A context in which new arrays are kept in host memory: a whole model may not fit one accelerator."""
+    import jax
+
+    try:
+        cpu = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS without cpu
+        return contextlib.nullcontext()
+    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
+
+
+def reduced(frozen, dtype: str):
+    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
+    from .core.params import flatten, unflatten
+    from .cost import keeps_float32
+
+    with on_host():
+        return unflatten(
+            {path: x if keeps_float32(path) else x.astype(dtype) for path, x in flatten(frozen).items()}
+        )
 
 
 def check_batch(batch: int, mesh) -> None:
@@ -180,6 +210,9 @@ def run_stage(args, stage, params, cfg, mesh=None):
         specs = attach(specs, added)
     if stage.objective in ("vae", "recon"):
         frozen, frozen_specs = {}, {}
+    dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+    if dtype != "float32":
+        frozen = reduced(frozen, dtype)
     if mesh is not None:  # now, so that no device ever holds all of it twice
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     say = print if distributed.is_main() else (lambda *_: None)
@@ -223,7 +256,8 @@ def run_stage(args, stage, params, cfg, mesh=None):
     learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    params = merge(attach(params, unflatten(full)), unflatten(lora))
+    with on_host():
+        params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stage.objective == "vae":
         cfg = stages.measure_latents(params, source, cfg, args.seed)
     provenance = {"stage": stage.name, "steps": int(state["step"]), "skipped": int(state["skipped"])}

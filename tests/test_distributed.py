@@ -34,8 +34,8 @@ def start(out: Path, count: int, data: int, fsdp: int, *options: str, lost: int 
         }
         command = [sys.executable, str(WORKER), str(out), str(data), str(fsdp), "6", *options]
         command += ["--die-after", str(after)] if index == lost else []
-        log = (out.parent / f"{out.name}.{index}.txt").open("a")
-        processes.append(subprocess.Popen(command, env=environment, stdout=log, stderr=log))
+        with (out.parent / f"{out.name}.{index}.txt").open("a") as log:
+            processes.append(subprocess.Popen(command, env=environment, stdout=log, stderr=log))
     return processes
 
 

@@ -275,15 +275,17 @@ def batch_axes(batch: int) -> tuple[str, ...] | None:
     return over or None
 
 
-def by_heads(q: jax.Array, k: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def by_heads(q: jax.Array, k: jax.Array, v: jax.Array, dtype) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The border into attention over all tokens: q [l, heads, e], k and v [s, heads, e] of one scene.
 
     If `seq` divides the heads, each device takes all tokens of some heads: XLA makes all-to-alls of it, a quarter of
     the volume of gathering keys and values at seq=8, and the fused GPU kernel accepts no other layout. Otherwise
-    queries stay split by token, and keys and values are gathered.
+    queries stay split by token, and keys and values are gathered. `dtype` is that of attention's matrix products,
+    so that no wider numbers travel.
     """
     if ways("seq") == 1:
         return q, k, v
+    q, k, v = (x.astype(dtype) for x in (q, k, v))
     if q.shape[-2] % ways("seq"):
         if jax.default_backend() == "gpu":
             fit = ", ".join(map(str, _divisors(q.shape[-2])))

@@ -213,8 +213,9 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
     q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
     k = split_heads(rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS), heads)
     v = split_heads(linear(p["v"], x), heads)
-    q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v)
-    y = merge_heads(attention(q, k, v, dtype=p["q"]["kernel"].dtype))
+    dtype = p["q"]["kernel"].dtype
+    q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v, dtype)
+    y = merge_heads(attention(q, k, v, dtype=dtype))
     return linear(p["o"], constrain(y, ("tokens", None)))
 
 
@@ -222,9 +223,9 @@ def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
     dtype = p["q"]["kernel"].dtype
     q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
-    y = attention(*by_heads(q, kv["k"], kv["v"]), dtype=dtype)
+    y = attention(*by_heads(q, kv["k"], kv["v"], dtype), dtype=dtype)
     if "k_img" in kv:
-        y = y + attention(*by_heads(q, kv["k_img"], kv["v_img"]), dtype=dtype)
+        y = y + attention(*by_heads(q, kv["k_img"], kv["v_img"], dtype), dtype=dtype)
     return linear(p["o"], constrain(merge_heads(y), ("tokens", None)))
 
 
