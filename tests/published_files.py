@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import zipfile
 from pathlib import Path
 
 import ml_dtypes
@@ -88,3 +89,66 @@ def save_sharded(folder: Path, tensors, shards=3, stem="diffusion_pytorch_model"
     index = {"metadata": {}, "weight_map": files}
     (folder / f"{stem}.safetensors.index.json").write_text(json.dumps(index))
     return folder
+
+
+def save_headers(file: Path, shapes, dtype="F32", dtypes=None) -> Path:
+    """A safetensors file of full size that takes no disk: true header, all values zero (a sparse file)."""
+    sizes = {"F32": 4, "BF16": 2}
+    entries, end = {}, 0
+    for key, shape in shapes.items():
+        kind = (dtypes or {}).get(key, dtype)
+        begin, end = end, end + int(np.prod(shape)) * sizes[kind]
+        entries[key] = {"dtype": kind, "shape": list(shape), "data_offsets": [begin, end]}
+    header = json.dumps(entries).encode()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("wb") as f:
+        f.write(len(header).to_bytes(8, "little") + header)
+        f.truncate(8 + len(header) + end)
+    return file
+
+
+def save_listing(file: Path, name: str, column="official key", prefix="") -> Path:
+    """The headers of a released checkpoint from its listing in tests/fixtures/key_listings."""
+    from parity import key_listing
+
+    rows = key_listing(name)
+    kinds = {"float32": "F32", "bfloat16": "BF16"}
+    column_of_dtype = next((c for c in rows[0] if c.startswith("dtype")), None)
+    dtypes = {prefix + row[column]: kinds[row[column_of_dtype]] for row in rows} if column_of_dtype else {}
+    return save_headers(file, {prefix + row[column]: row["shape"] for row in rows}, dtypes=dtypes)
+
+
+def save_torch(file: Path, shapes, value, wrapper: str | None = None, dtypes=None) -> Path:
+    """A PyTorch zip file, written tensor by tensor and without PyTorch.
+
+    `value(key, shape)` gives an array; `wrapper` puts the tensors into {wrapper: tensors}. Opcodes are those that
+    PyTorch writes, so that its weights-only loader reads the file too.
+    """
+    storages = {"F32": ("FloatStorage", np.float32), "BF16": ("BFloat16Storage", ml_dtypes.bfloat16)}
+
+    def text(s: str) -> bytes:
+        return b"X" + len(s.encode()).to_bytes(4, "little") + s.encode()
+
+    def number(n: int) -> bytes:
+        return b"J" + n.to_bytes(4, "little", signed=True)
+
+    def sizes(shape) -> bytes:
+        return b"(" + b"".join(map(number, shape)) + b"t"
+
+    content = b"\x80\x02" + (b"}" + text(wrapper) if wrapper else b"") + b"}("
+    for i, (key, shape) in enumerate(shapes.items()):
+        kind = storages[(dtypes or {}).get(key, "F32")][0]
+        count = int(np.prod(shape))
+        strides = [int(np.prod(shape[j + 1 :])) for j in range(len(shape))]
+        storage = b"(" + text("storage") + f"ctorch\n{kind}\n".encode() + text(str(i)) + text("cpu")
+        content += text(key) + b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + number(count) + b"tQ"
+        content += number(0) + sizes(shape) + sizes(strides) + b"\x89ccollections\nOrderedDict\n)RtR"
+    content += b"u" + (b"s" if wrapper else b"") + b"."
+    with zipfile.ZipFile(file, "w", allowZip64=True) as archive:
+        archive.writestr("archive/data.pkl", content)
+        archive.writestr("archive/byteorder", "little")
+        for i, (key, shape) in enumerate(shapes.items()):
+            dtype = storages[(dtypes or {}).get(key, "F32")][1]
+            archive.writestr(f"archive/data/{i}", np.ascontiguousarray(value(key, shape), dtype).tobytes())
+        archive.writestr("archive/version", "3\n")
+    return file

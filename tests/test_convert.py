@@ -1,5 +1,7 @@
-"""Import of published checkpoints: layouts, formats, mixtures, bad files, memory and interruption."""
+"""Import of published checkpoints: layouts, formats, mixtures, bad files and interruption."""
 
+import dataclasses
+import itertools
 import json
 import os
 import pickle
@@ -198,6 +200,49 @@ def test_framecrafter_is_merged_into_the_transformer(files, tmp_path):
     np.testing.assert_allclose(ours, np.einsum("c,hwcd->hwd", rays, whole[:, :, 36:]), rtol=0, atol=1e-5)
 
 
+def test_a_whole_framecrafter_transformer(files, tmp_path):
+    """420 input channels in one complete file, given with --wan."""
+    cfg = dataclasses.replace(CONFIG.dit, in_channels=36 + RAYS)
+    tree, tensors = made.dit_tensors(cfg)
+    made.save(tmp_path / "full.safetensors", tensors)
+    arguments = ["--wan", tmp_path / "full.safetensors", "--random", "encoder", "renderer", "vae"]
+    plan, _ = convert.make_plan(parse(convert.parser(), [*map(str, arguments), "--preset", str(files["config"])]))
+    values = {f.path: f.make(f.source.read(f.key)) for f in plan.fills if "embed" in f.path and f.layer is None}
+    np.testing.assert_array_equal(values["dit/patch_embed/kernel"], tree["patch_embed/kernel"][:, :, :36])
+    rays = np.split(values["fusion/rays_embed/kernel"], 4, axis=2)
+    np.testing.assert_array_equal(rays[3], tree["patch_embed/kernel"][:, :, 36:] / 4)
+
+
+@pytest.mark.parity
+@pytest.mark.filterwarnings("ignore")  # of the libraries under test
+def test_prompt_rows_from_a_umt5_encoder(tmp_path):
+    """A tiny random encoder in a diffusers folder: rows of the true length, zeros behind."""
+    torch = pytest.importorskip("torch")
+    transformers = pytest.importorskip("transformers")
+    tokenizers = pytest.importorskip("tokenizers")
+    from roge_jax.weights.prompt import encode_prompt
+
+    words = tokenizers.Tokenizer(tokenizers.models.WordLevel({"<pad>": 0, "</s>": 1, "<unk>": 2, "a": 3, "room": 4}, "<unk>"))
+    words.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    words.post_processor = tokenizers.processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
+    fast = transformers.PreTrainedTokenizerFast(tokenizer_object=words, eos_token="</s>", pad_token="<pad>", unk_token="<unk>")
+    fast.save_pretrained(tmp_path / "tokenizer")
+    config = transformers.UMT5Config(
+        vocab_size=8, d_model=8, d_kv=4, d_ff=16, num_layers=2, num_heads=2, feed_forward_proj="gated-gelu"
+    )
+    torch.manual_seed(0)
+    net = transformers.UMT5EncoderModel(config).to(torch.bfloat16).eval()
+    net.save_pretrained(tmp_path / "text_encoder")
+    for text, ids in (("", [1]), ("  a\n room &amp;amp; ", [3, 4, 2, 1])):
+        rows = encode_prompt(tmp_path, text, CONFIG.dit)
+        inputs = {"input_ids": torch.tensor([ids]), "attention_mask": torch.ones(1, len(ids), dtype=torch.long)}
+        want = net(**inputs).last_hidden_state[0].float().detach().numpy()
+        np.testing.assert_array_equal(rows[: len(ids)], want)
+        assert rows.shape == (6, 8) and not rows[len(ids) :].any()
+    with pytest.raises(UserError, match="no umT5 encoder and tokenizer there"):
+        encode_prompt(tmp_path / "tokenizer", "", CONFIG.dit)
+
+
 # ---- formats -------------------------------------------------------------------------------------
 
 
@@ -235,6 +280,31 @@ def pytorch_zip(file: Path, content: bytes) -> Path:
         archive.writestr("archive/data.pkl", content)
         archive.writestr("archive/data/0", bytes(64))
     return file
+
+
+@pytest.mark.parametrize("wrapper", [None, "model", "state_dict"])
+def test_pytorch_files_without_pytorch(tmp_path, wrapper):
+    tensors = made.recon_tensors()[1]
+    kinds = {k: "BF16" for k, v in tensors.items() if v.dtype == BF16}
+    shapes = {k: v.shape for k, v in tensors.items()}
+    file = made.save_torch(tmp_path / "m.pt", shapes, lambda k, _: tensors[k], wrapper, kinds)
+    source = sources.open_source(file)
+    assert source.shapes == shapes
+    for key, value in tensors.items():
+        np.testing.assert_array_equal(source.read(key), value, err_msg=key)
+        assert source.read(key).dtype == value.dtype
+
+
+@pytest.mark.parity
+def test_pytorch_reads_the_files_that_these_tests_write(tmp_path):
+    torch = pytest.importorskip("torch")
+    tensors = made.vae_tensors()[1]
+    shapes = {k: v.shape for k, v in tensors.items()}
+    file = made.save_torch(tmp_path / "m.pth", shapes, lambda k, _: tensors[k], "model")
+    state = torch.load(file, weights_only=True)["model"]
+    assert state.keys() == tensors.keys()
+    for key, value in tensors.items():
+        np.testing.assert_array_equal(state[key].numpy(), value, err_msg=key)
 
 
 def tensor_pickle(shape: str, strides: str, start=0) -> bytes:
@@ -441,6 +511,33 @@ def test_a_killed_conversion_resumes_to_the_same_files(files, tmp_path, monkeypa
     assert sorted(p.name for p in (tmp_path / "m").iterdir()) == names
     for name in names:
         assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+
+
+def test_an_interrupt_keeps_what_is_done(files, tmp_path):
+    plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in everything(files)]))
+    calls = []
+
+    def interrupt(done, total):
+        calls.append(done)
+        if len(calls) == 30:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        importer.write(plan, tmp_path / "m", progress=interrupt)
+    assert (tmp_path / "m.part" / importer.PROGRESS).read_text() == "29"
+    calls.clear()
+    importer.write(plan, tmp_path / "m", resume=True, progress=lambda done, total: calls.append((done, total)))
+    assert (tmp_path / "m" / "config.json").exists() and not (tmp_path / "m" / importer.PLAN).exists()
+    assert all(a[0] < b[0] <= b[1] for a, b in itertools.pairwise(calls))
+
+
+def test_a_mistake_is_one_line_and_code_two(files, tmp_path, capsys):
+    from roge_jax.entry import execute
+
+    code = execute(convert.main, convert.parser(), ["--wan", str(files["lagernvs"]), "--out", str(tmp_path / "m")])
+    printed = capsys.readouterr()
+    assert code == 2 and printed.err.count("\n") == 1 and printed.err.startswith("error: ")
+    assert "Traceback" not in printed.err and not list(tmp_path.iterdir())
 
 
 def test_without_resume_it_starts_over(files, tmp_path):

@@ -19,7 +19,7 @@ LICENCES = {
     "--vggt": ("VGGT-1B", "the VGGT license", "https://huggingface.co/facebook/VGGT-1B"),
     "--wan": ("Wan2.1", "Apache-2.0", "https://huggingface.co/Wan-AI"),
     "--wan-vae": ("Wan2.1 VAE", "Apache-2.0", "https://huggingface.co/Wan-AI"),
-    "--framecrafter": ("FrameCrafter", "see its repository", "its repository"),
+    "--framecrafter": ("FrameCrafter", "ask its authors", "https://github.com/szqwu/FrameCrafter"),
 }
 
 

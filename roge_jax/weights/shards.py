@@ -24,6 +24,7 @@ from .sources import DTYPES
 NAMES = {dtype: name for name, dtype in DTYPES.items()}
 SHARD_BYTES = 4_000_000_000
 BLOCK_BYTES = 64_000_000  # converted at a time
+TILE = 256  # rows and columns copied at a time when transposing
 
 
 class Place(NamedTuple):
@@ -109,7 +110,7 @@ class Shards:
             for i in range(0, shape[0], rows):
                 # First cast in the order of the source, then transpose: both copies are of one block alone.
                 block = value[i : i + rows].astype(place.dtype, order="K", copy=False)
-                _write_all(file, np.ascontiguousarray(block).reshape(-1).view(np.uint8))
+                _write_all(file, _contiguous(block).reshape(-1).view(np.uint8))
         except OSError as error:
             _disk(error, Path(file.name))
 
@@ -122,6 +123,17 @@ class Shards:
         for file in self.files:
             with contextlib.suppress(OSError):
                 file.close()
+
+
+def _contiguous(x: np.ndarray) -> np.ndarray:
+    """`np.ascontiguousarray`, several times as fast for large transposed matrices: tile by tile stays in the cache."""
+    if x.ndim != 2 or x.flags.c_contiguous or x.size < TILE**2:
+        return np.ascontiguousarray(x)
+    y = np.empty(x.shape, x.dtype)
+    for i in range(0, x.shape[0], TILE):
+        for j in range(0, x.shape[1], TILE):
+            y[i : i + TILE, j : j + TILE] = x[i : i + TILE, j : j + TILE]
+    return y
 
 
 def _write_all(file, data) -> None:
