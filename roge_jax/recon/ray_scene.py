@@ -37,13 +37,17 @@ def attention_specs(d: int, heads: int, *, depth: int) -> Tree:
         "q": linear_specs(d, d, ("embed", "heads"), bias=False),
         "k": linear_specs(d, d, ("embed", "heads"), bias=False),
         "v": linear_specs(d, d, ("embed", "heads"), bias=False),
-        "proj": linear_specs(d, d, ("heads", "embed"), bias=False, init=fan_in((3 * depth) ** -0.5)),
+        "proj": linear_specs(
+            d, d, ("heads", "embed"), bias=False, init=fan_in((3 * depth) ** -0.5)
+        ),
         "q_norm": norm_specs(d // heads, bias=False),
         "k_norm": norm_specs(d // heads, bias=False),
     }
 
 
-def attend(p: Tree, x, context, heads: int, *, rq: Relative | None = None, rk: Relative | None = None):
+def attend(
+    p: Tree, x, context, heads: int, *, rq: Relative | None = None, rk: Relative | None = None
+):
     """Queries x [v, l, d] on `context` [v, s, d], one per view, or [1, s, d], shared by all views.
 
     `rq` and `rk` are the cameras of the queries' and the keys' views; with them the context's tokens are
@@ -52,7 +56,7 @@ def attend(p: Tree, x, context, heads: int, *, rq: Relative | None = None, rk: R
     q = rms_norm(p["q_norm"], split_heads(linear(p["q"], x), heads), eps=EPS)
     k = rms_norm(p["k_norm"], split_heads(linear(p["k"], context), heads), eps=EPS)
     v = split_heads(linear(p["v"], context), heads)
-    if rq is not None:
+    if rq is not None and rk is not None:
         q, k, v = to_query(rq, q), _keys(rk, k), _keys(rk, v)
     dtype = p["q"]["kernel"].dtype
     # One matrix product for all views, unless they are on different devices.
@@ -118,7 +122,8 @@ def read_scene(p: Tree, x, scene, heads: int, rays: Relative | None, cameras: Re
     Returns the new rays and the normalised rays that a refinement of the scene attends to.
     """
     own = None if rays is None else inside(rays)
-    x = x + attend(p["self_attn"], *(2 * [_norm(p["norm_self"], x)]), heads, rq=own, rk=own)
+    y = _norm(p["norm_self"], x)
+    x = x + attend(p["self_attn"], y, y, heads, rq=own, rk=own)
     xn = _norm(p["norm_cross"], x)
     x = x + attend(p["cross_attn"], xn, scene, heads, rq=rays, rk=cameras)
     return x + mlp(p["mlp"], _norm(p["norm_mlp"], x), exact=True), xn
@@ -141,7 +146,9 @@ def _scene_reads(p, zn, xn, heads, rays, cameras):
 
     def one(zn, xn, project, unproject):
         own = Relative(project[None], unproject[None], rays.angles)
-        return attend(p, zn.reshape(m, s // m, d), xn[None], heads, rq=cameras, rk=own).reshape(s, d)
+        return attend(p, zn.reshape(m, s // m, d), xn[None], heads, rq=cameras, rk=own).reshape(
+            s, d
+        )
 
     assert u == v
     return jax.vmap(one)(zn, xn, rays.project, rays.unproject)
@@ -199,7 +206,9 @@ def query_rays(
     v, h, w, _ = plucker.shape
     levels = None
     if cfg.attention == "bidirectional" and cfg.refinement == "shared":
-        lead = None if rays is None else Relative(rays.project[:contexts], rays.unproject[:contexts], rays.angles)
+        lead = rays
+        if rays is not None and rays.project is not None and rays.unproject is not None:
+            lead = Relative(rays.project[:contexts], rays.unproject[:contexts], rays.angles)
         levels = shared_levels(p, z, plucker[:contexts], cfg=cfg, rays=lead, cameras=cameras)
 
     @functools.partial(jax.checkpoint, static_argnums=())
@@ -223,7 +232,9 @@ def query_rays(
             # A chunk takes every `chunks`-th view: devices that share chunks keep neighbouring views.
             return jnp.swapaxes(t.reshape(cfg.chunk, chunks, *t.shape[1:]), 0, 1)
 
-        x, out = jax.lax.map(lambda args: some(*args), tuple(split(t) for t in (plucker, project, unproject)))
+        x, out = jax.lax.map(
+            lambda args: some(*args), tuple(split(t) for t in (plucker, project, unproject))
+        )
         x = jnp.swapaxes(x, 0, 1).reshape(chunks * cfg.chunk, *x.shape[2:])[:v]
     features = x.reshape(v, h // cfg.patch, w // cfg.patch, -1)
     return (features, out) if collect else features
@@ -246,7 +257,8 @@ def _query(p, z, levels, plucker, *, cfg, rays, cameras, collect):
     if cfg.attention == "full":
 
         def full(x, p):
-            x = x + attend(p["self_attn"], *(2 * [_norm(p["norm_self"], x)]), heads)
+            y = _norm(p["norm_self"], x)
+            x = x + attend(p["self_attn"], y, y, heads)
             return x + mlp(p["mlp"], _norm(p["norm_mlp"], x), exact=True)
 
         x = jnp.concatenate([jnp.broadcast_to(z, (v, *z.shape[1:])), x], 1)

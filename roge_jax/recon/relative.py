@@ -22,7 +22,9 @@ class Relative(NamedTuple):
     angles: jax.Array
 
 
-def relative_cameras(K, c2w, size: tuple[int, int], *, grid: tuple[int, int], specials: int, head_dim: int):
+def relative_cameras(
+    K, c2w, size: tuple[int, int], *, grid: tuple[int, int], specials: int, head_dim: int
+):
     """`Relative` for views K [v, 3, 3] (pixels of `size` = height, width), c2w [v, 4, 4].
 
     The tokens of a view are `specials` position-free ones, then a row-major `grid`.
@@ -32,9 +34,29 @@ def relative_cameras(K, c2w, size: tuple[int, int], *, grid: tuple[int, int], sp
     fx, fy = K[:, 0, 0] / width, K[:, 1, 1] / height
     cx, cy = K[:, 0, 2] / width - 0.5, K[:, 1, 2] / height - 0.5
     zero, one = jnp.zeros(v), jnp.ones(v)
-    lift = jnp.stack([fx, zero, cx, zero, zero, fy, cy, zero, zero, zero, one, zero, zero, zero, zero, one], -1)
+    lift = jnp.stack(
+        [fx, zero, cx, zero, zero, fy, cy, zero, zero, zero, one, zero, zero, zero, zero, one], -1
+    )
     unlift = jnp.stack(
-        [1 / fx, zero, -cx / fx, zero, zero, 1 / fy, -cy / fy, zero, zero, zero, one, zero, zero, zero, zero, one], -1
+        [
+            1 / fx,
+            zero,
+            -cx / fx,
+            zero,
+            zero,
+            1 / fy,
+            -cy / fy,
+            zero,
+            zero,
+            zero,
+            one,
+            zero,
+            zero,
+            zero,
+            zero,
+            one,
+        ],
+        -1,
     )
     rotation, origin = c2w[:, :3, :3], c2w[:, :3, 3]
     back = jnp.swapaxes(rotation, 1, 2)

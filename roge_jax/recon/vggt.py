@@ -54,7 +54,9 @@ def block_specs(d: int, heads: int, *, qk_norm: bool, depth: int) -> Tree:
     }
 
 
-def block(p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None, relative: Relative | None = None):
+def block(
+    p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None, relative: Relative | None = None
+):
     """x [v, l, d] -> the same shape. `rotate` turns queries and keys [v, l, k, e]; with `relative` the attention is
     over all views at once and their cameras act on queries, keys, values and outputs.
     """
@@ -93,7 +95,9 @@ def dino_specs(cfg: EncoderConfig) -> Tree:
         "pos_embed": Spec((tokens, d), (None, "embed"), normal(0.02)),
         "register_tokens": Spec((cfg.registers, d), (None, "embed"), normal(0.02)),
         "mask_token": Spec((d,), ("embed",), normal(0.02)),  # in the official files, never used
-        "blocks": stack(block_specs(d, cfg.heads, qk_norm=False, depth=cfg.dino_depth), cfg.dino_depth),
+        "blocks": stack(
+            block_specs(d, cfg.heads, qk_norm=False, depth=cfg.dino_depth), cfg.dino_depth
+        ),
         "norm": norm_specs(d),
     }
 
@@ -206,18 +210,24 @@ def aggregate(
 
     def rotate(t, angles):
         row, column = jnp.split(t, 2, axis=-1)
-        return jnp.concatenate([rotate_halves(row, angles[:, 0]), rotate_halves(column, angles[:, 1])], -1)
+        return jnp.concatenate(
+            [rotate_halves(row, angles[:, 0]), rotate_halves(column, angles[:, 1])], -1
+        )
 
     def across_views(p, x):
         if relative is not None:
             return block(p, x, cfg.heads, eps=EPS, relative=relative)
         turn = functools.partial(rotate, angles=jnp.tile(angles, (m, 1, 1)))
-        return block(p, x.reshape(1, -1, x.shape[-1]), cfg.heads, eps=EPS, rotate=turn).reshape(x.shape)
+        return block(p, x.reshape(1, -1, x.shape[-1]), cfg.heads, eps=EPS, rotate=turn).reshape(
+            x.shape
+        )
 
     @jax.checkpoint
     def pair(carry, p):
         frame, overall = p
-        x = block(frame, carry[1], cfg.heads, eps=EPS, rotate=functools.partial(rotate, angles=angles))
+        x = block(
+            frame, carry[1], cfg.heads, eps=EPS, rotate=functools.partial(rotate, angles=angles)
+        )
         carry = (x, across_views(overall, x))
         return carry, carry if collect else None
 
@@ -258,7 +268,12 @@ def encode_scene(
         images = jax.image.resize(images, (m, *size, 3), "bilinear", antialias=True)
         plucker = jax.image.resize(plucker, (m, *size, 6), "bilinear", antialias=True)
     tokens, _ = aggregate(
-        p, images, camera_tokens(p["camera_mlp"], vectors), cfg=cfg, plucker=plucker, relative=relative
+        p,
+        images,
+        camera_tokens(p["camera_mlp"], vectors),
+        cfg=cfg,
+        plucker=plucker,
+        relative=relative,
     )
     z = linear(p["connector"], tokens[:, SPECIALS + cfg.registers :])
     return layer_norm(p["connector_norm"], z, eps=EPS)

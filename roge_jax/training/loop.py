@@ -14,7 +14,7 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,12 +42,16 @@ class LoopConfig:
     log_every: int = 10
     save_every: int = 100
     keep: int = 3
-    max_skipped: float = 0.01  # stop when more than this share of the steps was skipped (after 100 steps) ...
+    max_skipped: float = (
+        0.01  # stop when more than this share of the steps was skipped (after 100 steps) ...
+    )
     max_streak: int = 10  # ... or this many in a row
     patience: int = 200  # stop when the loss stays beyond best + 6 MAD for this many steps
 
 
-def initial_state(trainable: Tree, optimiser: optax.GradientTransformation, optim: OptimConfig) -> Tree:
+def initial_state(
+    trainable: Tree, optimiser: optax.GradientTransformation, optim: OptimConfig
+) -> Tree:
     """Everything that a checkpoint must hold to continue exactly."""
     state = {
         "params": trainable,
@@ -61,7 +65,9 @@ def initial_state(trainable: Tree, optimiser: optax.GradientTransformation, opti
     return state
 
 
-def make_step(objective: Callable, optimiser: optax.GradientTransformation, optim: OptimConfig) -> Callable:
+def make_step(
+    objective: Callable, optimiser: optax.GradientTransformation, optim: OptimConfig
+) -> Callable:
     """step(state, frozen, batch, key) -> (state, metrics), to be jitted with the state donated.
 
     `objective(trainable, frozen, batch, key)` returns (loss, terms). A step with a loss or gradient that is not
@@ -84,7 +90,12 @@ def make_step(objective: Callable, optimiser: optax.GradientTransformation, opti
         new["step"] = state["step"] + 1
         new["skipped"] = state["skipped"] + bad
         new["streak"] = (state["streak"] + 1) * bad
-        metrics = {"loss": loss, "grad_norm": norm, "skipped": new["skipped"], "streak": new["streak"]}
+        metrics = {
+            "loss": loss,
+            "grad_norm": norm,
+            "skipped": new["skipped"],
+            "streak": new["streak"],
+        }
         return new, metrics | terms
 
     return step
@@ -116,7 +127,9 @@ class DivergenceDetector:
         return self.beyond >= self.patience
 
 
-def prefetched(batches: Callable[[int], dict], first: int, last: int, depth: int = 2) -> Iterator[dict]:
+def prefetched(
+    batches: Callable[[int], dict], first: int, last: int, depth: int = 2
+) -> Generator[dict, None, None]:
     """batches(first), .., batches(last - 1), prepared by a thread while the device works."""
     ready: queue.Queue = queue.Queue(maxsize=depth)
     stop = threading.Event()
@@ -216,12 +229,23 @@ def train(
     first, detector = int(state["step"]), DivergenceDetector(loop.patience)
     started, logged, terms = time.perf_counter(), first, []
     bar = tqdm(
-        total=loop.steps, initial=first, desc=name, dynamic_ncols=True, mininterval=1.0, disable=not is_main()
+        total=loop.steps,
+        initial=first,
+        desc=name,
+        dynamic_ncols=True,
+        mininterval=1.0,
+        disable=not is_main(),
     )
     source = contextlib.closing(prefetched(batches, first, loop.steps))
 
     log_file = log_path if is_main() else Path(os.devnull)
-    with log_file.open("a") as log, bar, contextlib.closing(checkpoints), source as ready, sharding.use(mesh):
+    with (
+        log_file.open("a") as log,
+        bar,
+        contextlib.closing(checkpoints),
+        source as ready,
+        sharding.use(mesh),
+    ):
         for i, views in enumerate(ready, first):
             if mesh is not None:
                 views = global_batch(views, mesh, batch or len(next(iter(views.values()))))
@@ -239,7 +263,9 @@ def train(
             if evaluate and due(evaluate_every):
                 extra = evaluate(state.get("ema", state["params"]))
                 wrong = [k for k, v in extra.items() if not np.isfinite(v)]
-                reason = reason or (f"the evaluation gave {wrong[0]} = {extra[wrong[0]]}" if wrong else None)
+                reason = reason or (
+                    f"the evaluation gave {wrong[0]} = {extra[wrong[0]]}" if wrong else None
+                )
             if diagnose and due(diagnose_every):
                 extra = extra | diagnose(state["params"], frozen, views, jax.random.fold_in(key, i))
             # A line ends at every checkpoint, so that the log of a resumed run has the same lines.
@@ -257,8 +283,14 @@ def train(
                 terms, logged, started = [], done, time.perf_counter()
             if reason is not None:
                 last = checkpoints.latest()
-                good = f"step {last} in {checkpoints.folder}" if last else "none: it ended before the first"
-                raise TrainingStopped(f"Stopped at step {done}: {reason}. The last good checkpoint is {good}.")
+                good = (
+                    f"step {last} in {checkpoints.folder}"
+                    if last
+                    else "none: it ended before the first"
+                )
+                raise TrainingStopped(
+                    f"Stopped at step {done}: {reason}. The last good checkpoint is {good}."
+                )
             suspect = detector.beyond > 0 and done < loop.steps  # do not push good checkpoints out
             if due(loop.save_every) and not suspect:
                 checkpoints.save(done, state)
@@ -274,7 +306,10 @@ def _check_fits(folder: Path, step: int, state: Tree) -> None:
 
     def shapes(tree) -> dict[str, tuple[int, ...]]:
         leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
-        return {jax.tree_util.keystr(path, simple=True, separator="/"): tuple(x.shape) for path, x in leaves}
+        return {
+            jax.tree_util.keystr(path, simple=True, separator="/"): tuple(x.shape)
+            for path, x in leaves
+        }
 
     want = shapes(state)
     have = shapes(ocp.StandardCheckpointHandler().metadata(folder / str(step) / "default").tree)
@@ -301,11 +336,15 @@ def _mean_row(terms: list[dict]) -> dict:
     return row | {name: int(terms[-1][name]) for name in ("skipped", "streak")}
 
 
-def _why_stop(metrics: dict, done: int, loop: LoopConfig, detector: DivergenceDetector) -> str | None:
+def _why_stop(
+    metrics: dict, done: int, loop: LoopConfig, detector: DivergenceDetector
+) -> str | None:
     if metrics["streak"] >= loop.max_streak:
         return f"{int(metrics['streak'])} steps in a row had a loss or gradient that was not finite"
     if done >= 100 and metrics["skipped"] > loop.max_skipped * done:
-        return f"{int(metrics['skipped'])} of {done} steps had a loss or gradient that was not finite"
+        return (
+            f"{int(metrics['skipped'])} of {done} steps had a loss or gradient that was not finite"
+        )
     if detector.update(metrics["loss"]):
         return (
             f"the loss (average {detector.average:.4g}) has been far above its best level "

@@ -11,6 +11,7 @@ places here and nowhere else.
 
 import re
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 
@@ -218,10 +219,11 @@ def renderer_config(
     """The renderer's sizes and variant from names and shapes."""
     width, _, patch, _ = _shape(shapes, f"{prefix}tgt_embedder.proj.weight", "LagerNVS renderer")
     blocks = f"{prefix}renderer_core.renderer_blocks."
+    variant: Literal["bidirectional", "cross", "full"] = "cross"
     if f"{blocks}0.norm1_x.weight" in shapes:
         variant = "bidirectional"
-    else:
-        variant = "full" if f"{blocks}0.attn.proj.weight" in shapes else "cross"
+    elif f"{blocks}0.attn.proj.weight" in shapes:
+        variant = "full"
     return RendererConfig(
         patch=patch,
         width=width,
