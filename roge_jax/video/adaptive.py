@@ -6,6 +6,7 @@ controller shrinking its step until the budget is gone.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -88,7 +89,7 @@ def solve_bosh3(
         looked = jnp.where((s.stage == 0) & s.fresh, below, jnp.where(at_end, above, sigma))
         x = project(x, looked).astype(dtype)
         info = note(s.info, x, BAD_STATE, s.taken, looked)
-        info = info.replace(evaluations=info.evaluations + 1)
+        info = replace(info, evaluations=info.evaluations + 1)
         v = velocity(x, looked).astype(dtype)
         info = note(info, v, BAD_VELOCITY, s.taken, looked)
         slopes = jax.lax.dynamic_update_index_in_dim(s.slopes, v, s.stage, 0)
@@ -106,10 +107,11 @@ def solve_bosh3(
         crossed = accept & lands
         # first-same-as-last: an accepted step hands its last slope on, unless the field jumps there
         slopes = jnp.where(accept, slopes.at[0].set(v), slopes)
-        info = info.replace(rejected=info.rejected + jnp.where(reject, 3, 0).astype(jnp.int32))
+        info = replace(info, rejected=info.rejected + jnp.where(reject, 3, 0).astype(jnp.int32))
         spent = (info.evaluations >= max_evaluations) & ~(crossed & (s.piece == len(inner)))
         out = spent & (info.cause == FINE)
-        info = info.replace(
+        info = replace(
+            info,
             cause=jnp.where(out, OUT_OF_BUDGET, info.cause).astype(jnp.int32),
             step=jnp.where(out, s.taken, info.step).astype(jnp.int32),
             sigma=jnp.where(out, s.sigma, info.sigma),
@@ -148,7 +150,7 @@ def solve_bosh3(
 
     def last() -> tuple[Array, SolveInfo]:
         v = velocity(x, end.sigma).astype(dtype)
-        info = end.info.replace(evaluations=end.info.evaluations + 1)
+        info = replace(end.info, evaluations=end.info.evaluations + 1)
         info = note(info, v, BAD_VELOCITY, end.taken, end.sigma)
         return jnp.where(info.failed, x, x - end.sigma * v), info
 

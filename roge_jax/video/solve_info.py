@@ -1,5 +1,7 @@
 """What a sampler reports about its run, and the error it becomes."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -59,7 +61,8 @@ def note(info: SolveInfo, x: Array, cause: int, step, sigma: Array) -> SolveInfo
     bad = jnp.sum(~jnp.isfinite(x), dtype=jnp.int32)
     new = (bad > 0) & (info.cause == FINE)
     pick = lambda now, old: jnp.where(new, jnp.asarray(now, old.dtype), old)  # noqa: E731
-    return info.replace(
+    return replace(
+        info,
         cause=pick(cause, info.cause),
         step=pick(step, info.step),
         sigma=pick(sigma, info.sigma),

@@ -12,6 +12,7 @@ as an argument makes one compilation serve every grid of its length.
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -133,7 +134,7 @@ def solve(
     (stored, info), seen = jax.lax.scan(body, start, _rows(table))
     x0, info = _finish(table, stored, info, project)
     if keep_states:
-        info = info.replace(states=jnp.concatenate([seen[table.first], x0[None]]))
+        info = replace(info, states=jnp.concatenate([seen[table.first], x0[None]]))
     return x0, info
 
 
@@ -186,7 +187,7 @@ def _start(table: Table, x1: Array) -> Array:
     return begin * x1[None]
 
 
-def _rows(table: Table) -> dict[str, Array]:
+def _rows(table: Table) -> dict[str, np.ndarray]:
     return {"sigma": table.sigma, "side": table.side, "step": table.step, "mix": table.mix}
 
 
@@ -220,7 +221,7 @@ def _look_up(stored: Array, info: SolveInfo, row, project: Project | None):
 
 def _take_in(stored: Array, info: SolveInfo, row, v: Array, sigma: Array):
     """Check the velocity of a row and mix it in; a failed run stays where it is."""
-    info = info.replace(evaluations=info.evaluations + 1)
+    info = replace(info, evaluations=info.evaluations + 1)
     info = note(info, v, BAD_VELOCITY, row["step"], sigma)
     return jnp.where(info.failed, stored, _mix(row["mix"], stored, v)), info
 

@@ -114,10 +114,9 @@ def _quantile_map(weights: np.ndarray, means: np.ndarray, stds: np.ndarray):
         return (ndtr((x[..., None] - (1 - sigma) * means) / spread) * weights).sum(-1)
 
     def exact(x: Array, start: float = 1.0, end: float = 0.0) -> Array:
-        x = np.asarray(x, np.float64)[..., 0]
-        level = below(x, start)
-        low = np.full(x.shape, means.min() - 12 * max(stds.max(), 1.0))
-        high = np.full(x.shape, means.max() + 12 * max(stds.max(), 1.0))
+        level = below(np.asarray(x, np.float64)[..., 0], start)
+        low = np.full(level.shape, means.min() - 12 * max(stds.max(), 1.0))
+        high = np.full(level.shape, means.max() + 12 * max(stds.max(), 1.0))
         for _ in range(200):
             mid = 0.5 * (low + high)
             left = below(mid, end) < level
