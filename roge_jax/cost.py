@@ -18,7 +18,9 @@ from .core.params import flatten
 from .recon.vggt import SPECIALS, encoder_grid
 from .video.dit import FLOAT32_LEAVES
 
-SINGLE_PASS_BYTES = 2e9  # a VAE decoder whose largest tensor is above this works one latent frame at a time
+SINGLE_PASS_BYTES = (
+    2e9  # a VAE decoder whose largest tensor is above this works one latent frame at a time
+)
 
 
 def attention(queries: int, keys: int, width: int) -> float:
@@ -39,7 +41,9 @@ def encoder(cfg: EncoderConfig, height: int, width: int, m: int, scene_width: in
         return 24.0 * d * d * tokens + attention(tokens, tokens, d)
 
     embed = 2.0 * patches * cfg.patch**2 * (3 if cfg.dino_depth else 9) * d
-    per_view = embed + (cfg.dino_depth + cfg.depth) * block(tokens) + 4.0 * d * scene_width * patches
+    per_view = (
+        embed + (cfg.dino_depth + cfg.depth) * block(tokens) + 4.0 * d * scene_width * patches
+    )
     return m * per_view + cfg.depth * block(m * tokens)
 
 
@@ -57,7 +61,9 @@ def renderer_view(cfg: RendererConfig, height: int, width: int, scene_tokens: in
     return ends + (cfg.depth - 1) * both + cross
 
 
-def renderer(cfg: RendererConfig, height: int, width: int, scene_tokens: int, m: int, views: int) -> float:
+def renderer(
+    cfg: RendererConfig, height: int, width: int, scene_tokens: int, m: int, views: int
+) -> float:
     """Ray features of all views as this program computes them.
 
     Where the scene is refined once (`shared`) or never (`cross`), its keys and values serve every view of a chunk.
@@ -67,7 +73,10 @@ def renderer(cfg: RendererConfig, height: int, width: int, scene_tokens: int, m:
     if cfg.attention == "full" or (cfg.attention == "bidirectional" and not shared):
         return views * per_view
     keys = 4.0 * cfg.width**2 * scene_tokens * cfg.depth
-    reading = renderer_view(dataclasses.replace(cfg, attention="cross"), height, width, scene_tokens) - keys
+    reading = (
+        renderer_view(dataclasses.replace(cfg, attention="cross"), height, width, scene_tokens)
+        - keys
+    )
     chunks = -(-views // cfg.chunk)
     total = views * reading + chunks * keys
     return total + m * per_view if shared else total
@@ -99,7 +108,9 @@ def velocity(cfg: DiTConfig, tokens: int, rows: int | None = None) -> float:
 
 def fusion(config: RoGeConfig, views: int, slots: int) -> float:
     """Geometry adapter and the patch embeddings of rays and geometry: once per window."""
-    grid = (config.recon_height // config.renderer.patch) * (config.recon_width // config.renderer.patch)
+    grid = (config.recon_height // config.renderer.patch) * (
+        config.recon_width // config.renderer.patch
+    )
     c, d, patch = config.fusion.geometry_channels, config.dit.width, config.dit.patch
     adapter = 2.0 * views * grid * config.renderer.width * c
     return adapter + 2.0 * tokens_per_slot(config) * slots * patch**2 * (6 * 4 * 64 + 4 * c) * d
@@ -134,7 +145,9 @@ def _widths(cfg: VAEConfig) -> list[int]:
     return [cfg.base * k for k in cfg.multipliers]
 
 
-def vae_encode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False) -> float:
+def vae_encode(
+    cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False
+) -> float:
     """Video (frames = 1 + 4k) to latents."""
     widths, clip = _widths(cfg), _Clip(frames, height, width)
     total = clip.conv(3, widths[0], dense=dense)
@@ -153,7 +166,9 @@ def vae_encode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: b
     return total + clip.conv(z, z, dense=dense, time=1, space=1)
 
 
-def vae_decode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False) -> float:
+def vae_decode(
+    cfg: VAEConfig, frames: int, height: int, width: int, *, dense: bool = False
+) -> float:
     """Latents to a video of frames = 1 + 4k."""
     widths, temporal = _widths(cfg)[::-1], cfg.temporal[::-1]
     scale = 2 ** len(temporal)
@@ -168,7 +183,9 @@ def vae_decode(cfg: VAEConfig, frames: int, height: int, width: int, *, dense: b
                 total += clip._replace(frames=clip.frames - 1).conv(c, 2 * c, dense=dense, space=1)
                 clip = clip._replace(frames=2 * clip.frames - 1)
             clip = clip._replace(height=2 * clip.height, width=2 * clip.width)
-            total += clip.conv(c, c // 2, dense=dense, time=1, space=9 if dense else 4)  # see `vae.up_conv`
+            total += clip.conv(
+                c, c // 2, dense=dense, time=1, space=9 if dense else 4
+            )  # see `vae.up_conv`
     return total + clip.conv(widths[-1], 3, dense=dense)
 
 
@@ -220,7 +237,9 @@ class Estimate:
     @property
     def total_flops(self) -> float:
         """All of one window: the velocity counts `evaluations` times."""
-        return sum(f * (self.evaluations if name == "velocity" else 1) for name, f in self.flops.items())
+        return sum(
+            f * (self.evaluations if name == "velocity" else 1) for name, f in self.flops.items()
+        )
 
     @property
     def peak_bytes(self) -> float:
@@ -229,7 +248,12 @@ class Estimate:
 
 
 def estimate(
-    config: RoGeConfig, m: int, evaluations: int, *, dtype: Any = jnp.float32, fused_attention: bool = False
+    config: RoGeConfig,
+    m: int,
+    evaluations: int,
+    *,
+    dtype: Any = jnp.float32,
+    fused_attention: bool = False,
 ) -> Estimate:
     """A window with m photos. `fused_attention`: scores are never stored (GPU, bfloat16).
 
@@ -268,7 +292,9 @@ def estimate(
         + chunk * scores(ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
-        "velocity": features + scores(tokens, tokens, d.heads) + 4.0 * tokens * (6 * d.width + d.ffn),
+        "velocity": features
+        + scores(tokens, tokens, d.heads)
+        + 4.0 * tokens * (6 * d.width + d.ffn),
         "decode": MAPS * decoder_tensor_bytes(config, 4 if chunked else n),
     }
     counts = {
@@ -279,3 +305,61 @@ def estimate(
         "transformer tokens": tokens,
     }
     return Estimate(counts, flops, evaluations, weight_bytes(config, dtype), working)
+
+
+def report(
+    config: RoGeConfig,
+    m: int,
+    evaluations: int,
+    *,
+    frames: int,
+    later: int,
+    half: bool,
+    solver: str,
+) -> str:
+    """What `--dry-run` prints: a video of `frames` frames from m photos.
+
+    `later`: contexts of the windows after the first; `half`: bfloat16 and fused attention; `solver`: a line on it.
+    """
+    runs = -(-frames // config.frames)
+    later = later if runs > 1 else m
+    dtype = jnp.bfloat16 if half else jnp.float32
+    first, next_ = (
+        estimate(config, k, evaluations, dtype=dtype, fused_attention=half) for k in (m, later)
+    )
+    total = first.total_flops + (runs - 1) * next_.total_flops
+    peak = max(first.peak_bytes, next_.peak_bytes)
+    lh, lw = config.latent_size
+    lines = [
+        f"model     {config.name}: {sum(weight_bytes(config).values()) / 4e6:,.1f} M parameters, "
+        f"{sum(first.weights.values()) / 1e9:,.2f} GB in {'bfloat16' if half else 'float32'}",
+        f"video     {frames} frames of {config.height}x{config.width} (reconstruction at "
+        f"{config.recon_height}x{config.recon_width}), windows of {config.frames}: {runs}",
+        f"photos    {m}" + (f", then {later} with frames already made" if later != m else ""),
+        "tokens    " + ", ".join(f"{n:,} {name}" for name, n in first.tokens.items()),
+        f"latents   {config.slots(m)} x {lh} x {lw} x {config.vae.latent}",
+        f"solver    {solver}",
+        "",
+        f"{'stage (first window)':24s}{'FLOPs':>16s}{'working memory':>18s}",
+    ]
+    for name, flops in first.flops.items():
+        times = f", each of {evaluations}" if name == "velocity" else ""
+        work = _scaled(first.working_bytes[name], "B")
+        lines.append(f"{name + times:24s}{_scaled(flops, 'FLOP'):>16s}{work:>18s}")
+    return "\n".join(
+        [
+            *lines,
+            f"{'all windows':24s}{_scaled(total, 'FLOP'):>16s}",
+            "",
+            f"peak memory about {_scaled(peak, 'B')}: weights and the hungriest stage, beside the "
+            "runtime's own 0.3 to 0.6 GB",
+        ]
+    )
+
+
+def _scaled(value: float, unit: str) -> str:
+    """1.23e10 FLOP -> "12.3 GFLOP"."""
+    for prefix, size in (("P", 1e15), ("T", 1e12), ("G", 1e9), ("M", 1e6)):
+        if value >= size:
+            return f"{value / size:,.3g} {prefix}{unit}"
+    return f"{value / 1e3:,.3g} k{unit}"

@@ -30,7 +30,16 @@ from .errors import UserError, did_you_mean
 
 CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
 RECORD = "run.json"
-PACKAGES = ("roge_jax", "jax", "jaxlib", "flax", "numpy", "av", "opencv-contrib-python-headless", "pillow")
+PACKAGES = (
+    "roge_jax",
+    "jax",
+    "jaxlib",
+    "flax",
+    "numpy",
+    "av",
+    "opencv-contrib-python-headless",
+    "pillow",
+)
 
 
 # ---- running a program ---------------------------------------------------------------------------
@@ -86,7 +95,9 @@ def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse
     parser.error = error  # type: ignore[method-assign]
     args, unknown = parser.parse_known_args(list(arguments))
     if unknown:
-        options = [name for action in parser._actions for name in action.option_strings if name[:2] == "--"]
+        options = [
+            name for action in parser._actions for name in action.option_strings if name[:2] == "--"
+        ]
         word = unknown[0].partition("=")[0]
         if word.startswith("-"):
             raise UserError(f"Unknown option '{word}': {did_you_mean(word, options)}")
@@ -100,7 +111,9 @@ def one_of(options: Iterable[str]) -> Callable[[str], str]:
 
     def check(word: str) -> str:
         if word not in options:
-            raise argparse.ArgumentTypeError(f"unknown value '{word}': {did_you_mean(word, options).rstrip('.')}")
+            raise argparse.ArgumentTypeError(
+                f"unknown value '{word}': {did_you_mean(word, options).rstrip('.')}"
+            )
         return word
 
     return check
@@ -116,7 +129,12 @@ def number(low: float | None = None, *, whole: bool = True) -> Callable[[str], A
             value = int(text) if whole else float(text)
         except ValueError:
             value = None
-        if value is None or value != value or abs(value) == float("inf") or (low is not None and value < low):
+        if (
+            value is None
+            or value != value
+            or abs(value) == float("inf")
+            or (low is not None and value < low)
+        ):
             raise argparse.ArgumentTypeError(f"'{text}' is not a {kind}{bound}")
         return value
 
@@ -126,7 +144,10 @@ def number(low: float | None = None, *, whole: bool = True) -> Callable[[str], A
 def _expected_stops() -> tuple[type[BaseException], ...]:
     """Errors that mean the computation ended early, not that the program is wrong. Imported only once one is raised."""
     found = []
-    for module, name in (("video.solve_info", "SamplingError"), ("training.loop", "TrainingStopped")):
+    for module, name in (
+        ("video.solve_info", "SamplingError"),
+        ("training.loop", "TrainingStopped"),
+    ):
         loaded = sys.modules.get(f"{__package__}.{module}")
         if loaded is not None:
             found.append(getattr(loaded, name))
@@ -156,7 +177,11 @@ def cache_folder() -> Path | None:
     given = os.environ.get(CACHE_VARIABLE, "")
     if given.lower() in ("off", "0", "no"):
         return None
-    base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roge_jax"
+    base = (
+        Path(given)
+        if given
+        else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roge_jax"
+    )
     return base / f"programs-{_processor()}"
 
 
@@ -178,7 +203,10 @@ def enable_cache() -> Path | None:
         if not os.access(folder, os.W_OK):
             raise PermissionError
     except OSError:
-        warnings.warn(f"compiled programs are not kept: cannot write to {folder} (set {CACHE_VARIABLE})", stacklevel=2)
+        warnings.warn(
+            f"compiled programs are not kept: cannot write to {folder} (set {CACHE_VARIABLE})",
+            stacklevel=2,
+        )
         return None
     settings = {
         "jax_compilation_cache_dir": str(folder),
@@ -255,7 +283,11 @@ def environment() -> dict[str, Any]:
     }
     if "jax" in sys.modules:
         devices = sys.modules["jax"].devices()
-        found["device"] = {"backend": devices[0].platform, "kind": devices[0].device_kind, "count": len(devices)}
+        found["device"] = {
+            "backend": devices[0].platform,
+            "kind": devices[0].device_kind,
+            "count": len(devices),
+        }
     return found
 
 
@@ -265,8 +297,19 @@ def git_commit(folder: Path | None = None) -> str | None:
     if not (folder / ".git").exists():
         return None
     try:
-        call = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-        return subprocess.run(call, capture_output=True, text=True, timeout=5, check=True).stdout.strip()
+        call = [
+            "git",
+            "-C",
+            str(folder),
+            "describe",
+            "--always",
+            "--dirty",
+            "--abbrev=12",
+            "--exclude=*",
+        ]
+        return subprocess.run(
+            call, capture_output=True, text=True, timeout=5, check=True
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
 
@@ -288,7 +331,11 @@ def _plain(value: Any) -> Any:
         return _plain(value.tolist())
     if isinstance(value, Path):
         return str(value)
-    return None if isinstance(value, float) and (value != value or abs(value) == float("inf")) else value
+    return (
+        None
+        if isinstance(value, float) and (value != value or abs(value) == float("inf"))
+        else value
+    )
 
 
 # ---- output folders ------------------------------------------------------------------------------
@@ -305,13 +352,17 @@ def output_folder(out: str | Path) -> Iterator[Path]:
     if out.exists() and not out.is_dir():
         raise UserError(f"--out {out} is a file: give a folder.")
     if out.is_dir() and any(out.iterdir()) and not (out / RECORD).exists():
-        raise UserError(f"--out {out} has files that are not of an earlier run (no {RECORD}): give another folder.")
+        raise UserError(
+            f"--out {out} has files that are not of an earlier run (no {RECORD}): give another folder."
+        )
     part, old = (out.with_name(out.name + suffix) for suffix in (".part", ".old"))
     try:
         shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
     except OSError as error:
-        raise UserError(f"--out {out} cannot be written ({error.strerror}): give another folder.") from None
+        raise UserError(
+            f"--out {out} cannot be written ({error.strerror}): give another folder."
+        ) from None
     try:
         yield part
     except BaseException:

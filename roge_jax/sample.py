@@ -11,10 +11,8 @@ their cameras, in the scene's frame and unit), contact_sheet.png and run.json. d
 """
 
 import argparse
-import contextlib
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -35,56 +33,48 @@ def parser() -> argparse.ArgumentParser:
     from .video.solver_table import SOLVERS
 
     p = argparse.ArgumentParser(
-        prog="python -m roge_jax.sample", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m roge_jax.sample",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    p.add_argument("--checkpoint", default="mini", help="model folder, or the name of a shipped one (default: mini)")
+
+    def option(name: str, help: str, default: Any = None, **more: Any) -> None:
+        shown = "" if default is None else f" (default: {default})"
+        p.add_argument(name, default=default, help=help + shown, **more)
+
+    real = number(1e-30, whole=False)
+    option("--checkpoint", "model folder, or the name of a shipped one", "mini")
+    option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", "motorcycle")
+    paths = ", ".join(sorted(PRESETS))
+    path_help = (
+        f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false"
+    )
+    option("--trajectory", path_help, "orbit", metavar="NAME|FILE")
+    option("--frames", "length of the path; the model's window, or the file's own", type=number(1))
+    option("--steps", "sampling steps", STEPS, type=number(1))
+    option("--solver", ", ".join(SOLVERS), SOLVER, type=one_of(SOLVERS))
+    option("--schedule", ", ".join(SCHEDULES), SCHEDULE, type=one_of(SCHEDULES))
+    option("--seed", "seed of the noise: same seed, same frames", 0, type=number(0))
+    option("--out", "output folder", Path("outputs/sample"), type=Path)
+    ids_help = (
+        "how many photos, chosen to see as much as possible; or which, by number or name, with commas ('4,' is "
+        f"photo 4 alone), the first being the world frame; up to {DEFAULT_CONTEXT} if not given"
+    )
+    option("--context", ids_help, metavar="M|IDS")
+    option("--start", "the context photo a preset path starts from", 0, type=number(0))
+    option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
+    option("--size", "HEIGHTxWIDTH in pixels; the model's own if not given")
+    option("--scale", "divisor of all positions; the model's rule if not given", type=real)
+    slots_help = "latents of photos while sampling: noised to the current level, clean, or free"
+    option("--context-slots", slots_help, "noised", type=one_of(SLOTS))
+    long_help = "long paths: chain (later windows see frames already made) or independent"
+    option("--long", long_help, "chain", type=one_of(LONG))
+    option("--fps", "frames per second", 16.0, type=number(1e-3, whole=False))
+    option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     p.add_argument(
-        "--scene",
-        default="motorcycle",
-        help="scene folder, 'motorcycle' (two real photos, built in) or procedural:SEED (default: motorcycle)",
+        "--dry-run", action="store_true", help="print tokens, FLOPs and memory, and stop"
     )
-    p.add_argument(
-        "--trajectory",
-        default="orbit",
-        metavar="NAME|FILE",
-        help="a path file (.json), or one of "
-        + ", ".join(sorted(PRESETS))
-        + "; options follow a colon, as in orbit:degrees=90,swing=false (default: orbit)",
-    )
-    p.add_argument("--frames", type=number(1), help="length of the path (default: one window of the model, or the file)")
-    p.add_argument("--steps", type=number(1), default=STEPS, help=f"sampling steps (default: {STEPS})")
-    p.add_argument("--solver", type=one_of(SOLVERS), default=SOLVER, help=f"{', '.join(SOLVERS)} (default: {SOLVER})")
-    p.add_argument(
-        "--schedule", type=one_of(SCHEDULES), default=SCHEDULE, help=f"{', '.join(SCHEDULES)} (default: {SCHEDULE})"
-    )
-    p.add_argument("--seed", type=number(0), default=0, help="seed of the noise; same seed, same frames (default: 0)")
-    p.add_argument("--out", type=Path, default=Path("outputs/sample"), help="folder (default: outputs/sample)")
-    p.add_argument(
-        "--context",
-        metavar="M|IDS",
-        help="how many photos, chosen to see as much as possible, or which: numbers from 0 or names, separated by\n"
-        f"commas ('4,' is photo 4 alone); the first is the world frame (default: up to {DEFAULT_CONTEXT})",
-    )
-    p.add_argument("--start", type=number(0), default=0, help="the context photo a preset path starts from (default: 0)")
-    p.add_argument("--fov", type=number(1e-3, whole=False), help="vertical field of view of the video in degrees")
-    p.add_argument("--size", help="HEIGHTxWIDTH of the video in pixels (default: the model's own)")
-    p.add_argument("--scale", type=number(1e-30, whole=False), help="divisor of all positions (default: the model's rule)")
-    p.add_argument(
-        "--context-slots",
-        type=one_of(SLOTS),
-        default="noised",
-        help="what the known latents are while sampling: noised to the current level, clean, or free (default: noised)",
-    )
-    p.add_argument(
-        "--long",
-        type=one_of(LONG),
-        default="chain",
-        help="paths longer than a window: chain (later windows see frames already made) or independent (default: chain)",
-    )
-    p.add_argument("--fps", type=number(1e-3, whole=False), default=16.0, help="frames per second (default: 16)")
-    p.add_argument("--dtype", type=one_of(DTYPES), default="auto", help="of large matrices: auto, float32, bfloat16")
-    p.add_argument("--dry-run", action="store_true", help="print shapes, tokens, FLOPs and memory, make nothing")
-    p.add_argument("--debug", action="store_true", help="show where in the program an error comes from")
+    p.add_argument("--debug", action="store_true", help="show where an error comes from")
     return p
 
 
@@ -107,7 +97,9 @@ def model_config(args: argparse.Namespace, *, weights: bool):
     try:
         height, width = (int(side) for side in args.size.lower().split("x"))
     except ValueError:
-        raise UserError(f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}.") from None
+        raise UserError(
+            f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}."
+        ) from None
     patch = config.renderer.patch
     ratio = config.recon_height / config.height, config.recon_width / config.width
     return dataclasses.replace(
@@ -124,7 +116,7 @@ def context_ids(text: str | None, scene, most: int) -> list[int]:
     from .data.scene import select_context
 
     count = min(len(scene), most, DEFAULT_CONTEXT)
-    if text is not None and "," in text or text in scene.names:
+    if (text is not None and "," in text) or text in scene.names:
         return [_view(word.strip(), scene) for word in text.split(",") if word.strip()]
     if text is not None:
         if not text.isdigit() or not 1 <= int(text) <= min(len(scene), most):
@@ -142,8 +134,12 @@ def _view(word: str, scene) -> int:
     if word.isdigit() and int(word) < len(scene):
         return int(word)
     if word.isdigit():
-        raise UserError(f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0.")
-    raise UserError(f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}")
+        raise UserError(
+            f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0."
+        )
+    raise UserError(
+        f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}"
+    )
 
 
 def camera_path(args: argparse.Namespace, context, config):
@@ -162,7 +158,9 @@ def camera_path(args: argparse.Namespace, context, config):
         path = make_path(name, context, args.frames or config.frames, start=args.start, **options)
     if args.fov is not None:
         if not args.fov < 180:
-            raise UserError(f"--fov {args.fov:g}: the full vertical angle must lie between 0 and 180 degrees.")
+            raise UserError(
+                f"--fov {args.fov:g}: the full vertical angle must lie between 0 and 180 degrees."
+            )
         focal = 0.5 * config.height / np.tan(np.radians(args.fov) / 2)
         K = np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
         path = Cameras(np.repeat(K[None], len(path), 0), path.c2w)
@@ -172,25 +170,33 @@ def camera_path(args: argparse.Namespace, context, config):
 def _option(word: str, trajectory: str) -> tuple[str, Any]:
     name, equals, value = word.partition("=")
     if not equals:
-        raise UserError(f"--trajectory {trajectory}: '{word}' is no option: write NAME:OPTION=VALUE,OPTION=VALUE.")
+        raise UserError(
+            f"--trajectory {trajectory}: '{word}' is no option: write NAME:OPTION=VALUE,OPTION=VALUE."
+        )
     try:
         return name, json.loads(value.lower())
     except json.JSONDecodeError:
         return name, value
 
 
+def large_dtype(args: argparse.Namespace, parameters: float) -> str:
+    """The dtype of large matrices that --dtype means for a model of so many parameters."""
+    import jax
+
+    if args.dtype != "auto":
+        return args.dtype
+    return "bfloat16" if parameters > LARGE and jax.default_backend() != "cpu" else "float32"
+
+
 def load_weights(args: argparse.Namespace):
     """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
-    import jax
     import jax.numpy as jnp
 
     from . import checkpoint, cost, model
     from .core.params import count, flatten, unflatten
 
-    dtype = args.dtype
-    if dtype == "auto":
-        large = count(model.specs(checkpoint.load_config(checkpoint.find_model(args.checkpoint)))) > LARGE
-        dtype = "bfloat16" if large and jax.default_backend() != "cpu" else "float32"
+    config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
+    dtype = large_dtype(args, count(model.specs(config)))
     params, config = checkpoint.load_model(args.checkpoint, dtype=jnp.dtype(dtype))
     if dtype == "bfloat16":
         flat = flatten(params)
@@ -212,7 +218,13 @@ def transforms(names: list[str], cameras, height: int, width: int) -> dict[str, 
 
     frames = []
     for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {"file_path": f"frames/{name}", "fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        entry = {
+            "file_path": f"frames/{name}",
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2],
+            "cy": K[1, 2],
+        }
         frames.append(entry | {"transform_matrix": pose})
     return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
 
@@ -226,11 +238,17 @@ def write_outputs(folder: Path, result, photos, fps: float) -> None:
     write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
     video_io.write_video(folder / "video.mp4", result.frames, fps)
     video_io.write_video(folder / "preview.mp4", result.preview, fps)
-    rows = {"photos": photos.images, "generated": result.frames, "preview (reconstruction)": result.preview}
+    rows = {
+        "photos": photos.images,
+        "generated": result.frames,
+        "preview (reconstruction)": result.preview,
+    }
     video_io.write_png(folder / "contact_sheet.png", video_io.contact_sheet(rows))
 
 
-def record(args: argparse.Namespace, config, settings, scene, photos, result, clock: Clock) -> dict[str, Any]:
+def record(
+    args: argparse.Namespace, config, settings, scene, photos, result, clock: Clock
+) -> dict[str, Any]:
     """run.json: everything needed to know what was made and to make it again."""
     from .config import to_dict
 
@@ -289,10 +307,14 @@ def main(args: argparse.Namespace) -> None:
     with output_folder(args.out) as folder:
         with clock("load"):
             scene = load_scene(args.scene)
-            photos = sampling.read_photos(scene, context_ids(args.context, scene, config.max_context), config)
+            photos = sampling.read_photos(
+                scene, context_ids(args.context, scene, config.max_context), config
+            )
             path = camera_path(args, photos.cameras, config)
             params, _ = load_weights(args)
-        print(f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}")
+        print(
+            f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
+        )
         result = sampling.sample(params, config, photos, path, settings, stage=clock, progress=True)
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
@@ -300,15 +322,19 @@ def main(args: argparse.Namespace) -> None:
             write_outputs(folder, result, photos, args.fps)
         content = record(args, config, settings, scene, photos, result, clock)
         write_json(folder / "run.json", content)
-    stages = ", ".join(f"{name} {stage['seconds']:.1f} s" for name, stage in content["stages"].items())
-    print(f"{stages}; peak memory {content['stages']['total'].get('peak_memory_gb', float('nan')):.2f} GB")
-    print(f"wrote {args.out}/ (video.mp4, preview.mp4, frames, transforms.json, contact_sheet.png, run.json)")
+    stages = ", ".join(
+        f"{name} {stage['seconds']:.1f} s" for name, stage in content["stages"].items()
+    )
+    print(
+        f"{stages}; peak memory {content['stages']['total'].get('peak_memory_gb', float('nan')):.2f} GB"
+    )
+    print(
+        f"wrote {args.out}/ (video.mp4, preview.mp4, frames, transforms.json, contact_sheet.png, run.json)"
+    )
 
 
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text; weights are not read, photos are not decoded."""
-    import jax
-
     from . import cost, sampling
     from .data.scene import open_scene
     from .video import solvers
@@ -317,48 +343,27 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     if args.context is not None and args.context.isdigit():
         m = int(args.context)
         if not 1 <= m <= config.max_context:
-            raise UserError(f"--context {m}: this model ({config.name}) takes 1 to {config.max_context} photos.")
+            raise UserError(
+                f"--context {m}: this model ({config.name}) takes 1 to {config.max_context} photos."
+            )
     elif args.scene.startswith("procedural:"):
         m = min(DEFAULT_CONTEXT, config.max_context)
     else:
         m = len(context_ids(args.context, open_scene(args.scene), config.max_context))
     frames = args.frames or config.frames
-    runs = sampling.windows(frames, config.frames)
     adaptive = solvers.SOLVERS[settings.solver].method is None
-    evaluations = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)
-    fast = jax.default_backend() != "cpu"
-    half = args.dtype == "bfloat16" or (args.dtype == "auto" and fast and sum(cost.weight_bytes(config).values()) > 4 * LARGE)
-    later = sum(sampling.chained(m, config)) if settings.long == "chain" else m
-    most = max(m, later) if len(runs) > 1 else m
-    first, last = (
-        cost.estimate(config, k, evaluations, dtype="bfloat16" if half else "float32", fused_attention=half and fast)
-        for k in (m, most)
+    count = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)
+    guess = " (a guess: it chooses its own steps)" if adaptive else ""
+    return cost.report(
+        config,
+        m,
+        count,
+        frames=frames,
+        later=sum(sampling.chained(m, config)) if settings.long == "chain" else m,
+        half=large_dtype(args, sum(cost.weight_bytes(config).values()) / 4) == "bfloat16",
+        solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
-    total = first.total_flops + (len(runs) - 1) * last.total_flops
-    lines = [
-        f"model     {config.name}: {sum(cost.weight_bytes(config).values()) / 4e6:,.1f} M parameters, "
-        f"{sum(first.weights.values()) / 1e9:,.3f} GB as {'bfloat16' if half else 'float32'}",
-        f"video     {frames} frames of {config.height}x{config.width} (reconstruction at "
-        f"{config.recon_height}x{config.recon_width}), {len(runs)} windows of {config.frames}",
-        f"photos    {m}" + (f", then {most} with frames already made" if most != m else ""),
-        "tokens    " + ", ".join(f"{count:,} {name}" for name, count in first.tokens.items()),
-        f"latents   {config.slots(m)} x {config.latent_size[0]} x {config.latent_size[1]} x {config.vae.latent}",
-        f"solver    {settings.solver}, {settings.steps} steps: {evaluations} evaluations a window"
-        + (" (a guess: it chooses its own steps)" if adaptive else ""),
-        "",
-        f"{'stage (first window)':24s}{'TFLOP':>12s}{'working memory GB':>20s}",
-    ]
-    for name, flops in first.flops.items():
-        times = f" x {evaluations}" if name == "velocity" else ""
-        lines.append(f"{name + times:24s}{flops / 1e12:12.4f}{first.working_bytes[name] / 1e9:20.3f}")
-    lines += [
-        f"{'all windows':24s}{total / 1e12:12.4f}",
-        "",
-        f"peak memory about {last.peak_bytes / 1e9:,.2f} GB: weights and the largest stage, without the runtime's own",
-    ]
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(BrokenPipeError):
-        run(main, parser())
+    run(main, parser())

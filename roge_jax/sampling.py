@@ -82,7 +82,9 @@ class Result:
     cameras: Cameras
     normalisation: Normalisation
     evaluations: int  # of the velocity network, all windows together
-    windows: tuple[dict[str, Any], ...]  # {"frames": [first, last], "photos": [...], "generated": [...]}
+    windows: tuple[
+        dict[str, Any], ...
+    ]  # {"frames": [first, last], "photos": [...], "generated": [...]}
 
 
 def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
@@ -99,7 +101,9 @@ def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
     recon = None
     size = (config.recon_height, config.recon_width)
     same_shape = config.recon_height * config.width == config.recon_width * config.height
-    if size != (config.height, config.width) and same_shape:  # sharper than a resize of the smaller crop
+    if (
+        size != (config.height, config.width) and same_shape
+    ):  # sharper than a resize of the smaller crop
         recon, _ = prepare_photos(scene, ids, *size, drop_duplicates=False)
     return Photos(images[kept], recon, cameras[kept], tuple(ids))
 
@@ -161,7 +165,9 @@ def window_views(
     """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window."""
     targets = pad_path(targets, config.frames)
     cameras = concatenate(contexts, targets)
-    vectors = camera_vector(contexts, config.height, config.width, info.camera_scale, info.points_flag)
+    vectors = camera_vector(
+        contexts, config.height, config.width, info.camera_scale, info.points_flag
+    )
     views = {
         "context_rgb": images.astype(np.float32),
         "K": cameras.K.astype(np.float32),
@@ -183,7 +189,16 @@ class Programs(NamedTuple):
     preview: Callable  # (params, features) -> [n, recon_h, recon_w, 3]
 
 
-def velocity(params, prepared: model.Prepared, noise, x, sigma, *, config: RoGeConfig, slots: model.ContextSlots):
+def velocity(
+    params,
+    prepared: model.Prepared,
+    noise,
+    x,
+    sigma,
+    *,
+    config: RoGeConfig,
+    slots: model.ContextSlots,
+):
     """The network on a state whose context slots are first set as `slots` asks (the solver's own state keeps its own)."""
     field, project = model.sampling_field(params, prepared, noise, config=config, mode=slots)
     return field(x if project is None else project(x, sigma), sigma)
@@ -207,7 +222,9 @@ def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.
     return np.random.default_rng([seed, window]).standard_normal(shape, np.float32)
 
 
-def programs(params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots) -> Programs:
+def programs(
+    params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots
+) -> Programs:
     """Compile all pieces for the shapes of `views`, side by side: compiling is what a short run waits for."""
     m = views["context_rgb"].shape[0]
     fix = functools.partial
@@ -246,7 +263,7 @@ def sample(
     config: RoGeConfig,
     photos: Photos,
     path: Cameras,
-    settings: Settings = Settings(),  # noqa: B008 (frozen)
+    settings: Settings = Settings(),
     *,
     stage: Stage | None = None,
     progress: bool = False,
@@ -262,8 +279,12 @@ def sample(
     """
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
-    context, target, info = normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
-    grid = flow.schedule(settings.schedule, settings.steps, shift=config.flow.shift, solver=settings.solver)
+    context, target, info = normalise(
+        photos.cameras, path, rule=config.scale_rule, scale=settings.scale
+    )
+    grid = flow.schedule(
+        settings.schedule, settings.steps, shift=config.flow.shift, solver=settings.solver
+    )
     runs = windows(len(path), config.frames)
     bar = _bar(progress, settings, grid, len(runs))
     frames: list[np.ndarray] = []
@@ -278,7 +299,11 @@ def sample(
             kept, chosen = chain_views(context, target[:start], target[start:stop], config)
             images = np.concatenate([images[kept], made[chosen]])
             contexts = concatenate(context[kept], target[np.array(chosen, int)])
-            recon = None if recon is None else np.concatenate([recon[kept], _enlarged(made[chosen], recon)])
+            recon = (
+                None
+                if recon is None
+                else np.concatenate([recon[kept], _enlarged(made[chosen], recon)])
+            )
         views = window_views(images, recon, contexts, target[start:stop], info, config)
         m = len(contexts)
         if m not in cache:
@@ -295,21 +320,36 @@ def sample(
             frames.append(np.asarray(run.decode(params, x0))[:n])
             previews.append(np.asarray(run.preview(params, prepared.features))[:n])
         evaluations += count
-        told.append({"frames": [start, stop - 1], "photos": [photos.ids[i] for i in kept], "generated": chosen})
+        told.append(
+            {
+                "frames": [start, stop - 1],
+                "photos": [photos.ids[i] for i in kept],
+                "generated": chosen,
+            }
+        )
     bar.close()
     return Result(
-        np.concatenate(frames), np.concatenate(previews), to_host(path), info, evaluations, tuple(told)
+        np.concatenate(frames),
+        np.concatenate(previews),
+        to_host(path),
+        info,
+        evaluations,
+        tuple(told),
     )
 
 
-def integrate(run: Programs, params, prepared, noise, grid, settings: Settings, config: RoGeConfig, bar):
+def integrate(
+    run: Programs, params, prepared, noise, grid, settings: Settings, config: RoGeConfig, bar
+):
     """(latents of all slots, evaluations): noise to sample, one evaluation per step of the bar."""
     if solvers.SOLVERS[settings.solver].method is None:  # adaptive: one program, no steps to show
 
         @jax.jit
         def whole(params, prepared, noise):
             def field(x, sigma):
-                return velocity(params, prepared, noise, x, sigma, config=config, slots=settings.slots)
+                return velocity(
+                    params, prepared, noise, x, sigma, config=config, slots=settings.slots
+                )
 
             return solvers.solve(settings.solver, field, noise, grid)
 
@@ -322,8 +362,9 @@ def integrate(run: Programs, params, prepared, noise, grid, settings: Settings, 
         return run.velocity(params, prepared, noise, x, sigma)
 
     done, x = 0, noise
-    for done, _, x in solvers.iterate(settings.solver, field, noise, grid):
+    for count, _, state in solvers.iterate(settings.solver, field, noise, grid):
         bar.update(1)
+        done, x = count, state
     return jax.block_until_ready(x), done
 
 

@@ -43,7 +43,9 @@ def _whole(file: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def write_video(path: str | Path, frames: np.ndarray, fps: float = FPS, *, quality: int = 16) -> Path:
+def write_video(
+    path: str | Path, frames: np.ndarray, fps: float = FPS, *, quality: int = 16
+) -> Path:
     """Writes H.264 (yuv420p, index in front) that browsers play; returns the file written.
 
     `quality` is x264's constant rate factor, 0 lossless to 51. Without PyAV it is VP9 in a .webm of the same name,
@@ -59,7 +61,10 @@ def write_video(path: str | Path, frames: np.ndarray, fps: float = FPS, *, quali
         import av  # noqa: F401
     except ImportError:
         webm = path.with_suffix(".webm")
-        warnings.warn(f"PyAV is not installed: {webm.name} (VP9) is written instead of {path.name}", stacklevel=2)
+        warnings.warn(
+            f"PyAV is not installed: {webm.name} (VP9) is written instead of {path.name}",
+            stacklevel=2,
+        )
         with _whole(webm) as temporary:
             _write_vp9(temporary, frames, fps)
         return webm
@@ -94,7 +99,9 @@ def _write_vp9(file: Path, frames: np.ndarray, fps: float) -> None:
     h, w = frames.shape[1:3]
     writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"VP90"), fps, (w, h))
     if not writer.isOpened():
-        raise UserError(f"{file}: this OpenCV cannot write VP9 either: install PyAV (pip install av).")
+        raise UserError(
+            f"{file}: this OpenCV cannot write VP9 either: install PyAV (pip install av)."
+        )
     for pixels in frames:
         writer.write(np.ascontiguousarray(pixels[..., ::-1]))
     writer.release()
@@ -131,7 +138,9 @@ def _read_cv2(path: Path) -> list[np.ndarray]:
         frames.append(pixels[..., ::-1])
 
 
-def write_webp(path: str | Path, frames: np.ndarray, fps: float = FPS, *, quality: int = 80) -> Path:
+def write_webp(
+    path: str | Path, frames: np.ndarray, fps: float = FPS, *, quality: int = 80
+) -> Path:
     """An endless animated WebP: a seventh of a GIF's size, shown by every browser and code host."""
     from PIL import Image
 
@@ -166,14 +175,20 @@ def write_frames(folder: str | Path, frames: np.ndarray) -> list[str]:
     part = folder.with_name(folder.name + ".part")
     shutil.rmtree(part, ignore_errors=True)
     part.mkdir(parents=True)
-    names = [write_png(part / f"{i:04d}.png", pixels).name for i, pixels in enumerate(to_uint8(frames))]
+    names = [
+        write_png(part / f"{i:04d}.png", pixels).name for i, pixels in enumerate(to_uint8(frames))
+    ]
     shutil.rmtree(folder, ignore_errors=True)
     part.rename(folder)
     return names
 
 
 def contact_sheet(
-    rows: dict[str, Sequence[np.ndarray] | np.ndarray], *, columns: int = 8, gap: int = 4, min_height: int = 96
+    rows: dict[str, Sequence[np.ndarray] | np.ndarray],
+    *,
+    columns: int = 8,
+    gap: int = 4,
+    min_height: int = 96,
 ) -> np.ndarray:
     """Rows of pictures on white, the name of each row above it; uint8 [H, W, 3].
 

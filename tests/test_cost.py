@@ -51,12 +51,19 @@ class TestPublishedCounts:
 
     @pytest.mark.parametrize(
         ("slots", "height", "width", "tera", "digits"),
-        [(27, 192, 336, 208.2, 1), (21, 192, 336, 156.1, 1), (7, 192, 336, 49.1, 1), (27, 480, 832, 2490, 0)],
+        [
+            (27, 192, 336, 208.2, 1),
+            (21, 192, 336, 156.1, 1),
+            (7, 192, 336, 49.1, 1),
+            (27, 480, 832, 2490, 0),
+        ],
     )
     def test_transformer_of_14b(self, slots, height, width, tera, digits):
         tokens = slots * (height // 16) * (width // 16)
         rows = 512 + 257
-        near((cost.velocity(PAPER.dit, tokens, rows) + cost.text(PAPER.dit, rows)) / T, tera, digits)
+        near(
+            (cost.velocity(PAPER.dit, tokens, rows) + cost.text(PAPER.dit, rows)) / T, tera, digits
+        )
 
     def test_transformer_of_1_3b(self):
         cfg = preset("wan1.3b").dit
@@ -64,7 +71,11 @@ class TestPublishedCounts:
 
     @pytest.mark.parametrize(
         ("size", "frames", "encode", "decode"),
-        [((192, 336), 1, 0.431, 0.695), ((192, 336), 81, 26.3, 44.3), ((480, 832), 81, 163.7, 275.4)],
+        [
+            ((192, 336), 1, 0.431, 0.695),
+            ((192, 336), 81, 26.3, 44.3),
+            ((480, 832), 81, 163.7, 275.4),
+        ],
     )
     def test_vae(self, size, frames, encode, decode):
         digits = 3 if frames == 1 else 1
@@ -100,7 +111,9 @@ def _count(jaxpr) -> float:
         elif name == "conv_general_dilated":
             kernel = equation.invars[1].aval.shape
             out = p["dimension_numbers"].rhs_spec[0]
-            total += 2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / kernel[out]
+            total += (
+                2.0 * math.prod(equation.outvars[0].aval.shape) * math.prod(kernel) / kernel[out]
+            )
         else:
             turns = p["length"] if name == "scan" else 1
             for value in p.values():
@@ -145,7 +158,9 @@ class TestTracedPrograms:
 
     def test_encoder(self, name):
         config, m = preset(name), 3
-        cfg = dataclasses.replace(config.encoder, relative_cameras=False)  # their 4x4 matrices are not counted
+        cfg = dataclasses.replace(
+            config.encoder, relative_cameras=False
+        )  # their 4x4 matrices are not counted
         size = (config.recon_height, config.recon_width)
         p = abstract(vggt.encoder_specs(cfg, config.renderer.width))
 
@@ -160,7 +175,11 @@ class TestTracedPrograms:
     @pytest.mark.parametrize("attention", ["bidirectional", "cross", "full", "shared"])
     def test_renderer(self, name, attention):
         config, m, views, scene = preset(name), 2, 7, 24
-        kind = {"attention": "bidirectional", "refinement": "shared"} if attention == "shared" else {"attention": attention}
+        kind = (
+            {"attention": "bidirectional", "refinement": "shared"}
+            if attention == "shared"
+            else {"attention": attention}
+        )
         cfg = dataclasses.replace(config.renderer, relative_cameras=False, chunk=7, **kind)
         p = abstract(ray_scene.renderer_specs(cfg))
 
@@ -210,7 +229,9 @@ class TestEstimate:
         prepared = jax.eval_shape(lambda p, views: model.prepare(p, views, config=config), p, views)
 
         def step(p, prepared, x):
-            return sampling.velocity(p, prepared, x, x, jnp.float32(0.5), config=config, slots="noised")
+            return sampling.velocity(
+                p, prepared, x, x, jnp.float32(0.5), config=config, slots="noised"
+            )
 
         def decode(p, x):
             return sampling.decode(p, x, config=config, contexts=1)
@@ -219,5 +240,7 @@ class TestEstimate:
             ("decode", decode, (p, state)),
             ("velocity", step, (p, prepared, state)),
         ):
-            used = jax.jit(function).lower(*arguments).compile().memory_analysis().temp_size_in_bytes
+            used = (
+                jax.jit(function).lower(*arguments).compile().memory_analysis().temp_size_in_bytes
+            )
             assert 0.5 < e.working_bytes[name] / used < 2, name

@@ -64,7 +64,10 @@ class TestExitCodes:
     def test_warnings_are_one_line(self, capsys):
         import warnings
 
-        assert program(lambda args: warnings.warn("photos overlap little", UserWarning, stacklevel=1)) == 0
+        assert (
+            program(lambda args: warnings.warn("photos overlap little", UserWarning, stacklevel=1))
+            == 0
+        )
         assert capsys.readouterr().err == "warning: photos overlap little\n"
 
 
@@ -102,7 +105,9 @@ class TestCache:
     def run(self, code, **variables):
         env = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "ROGE_"))}
         call = [sys.executable, "-c", code]
-        done = subprocess.run(call, env=env | variables, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            call, env=env | variables, capture_output=True, text=True, timeout=300
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout
 
@@ -113,13 +118,19 @@ class TestCache:
             "print(os.environ['JAX_COMPILATION_CACHE_DIR'])"
         )
         returned, variable = self.run(code, XDG_CACHE_HOME=str(tmp_path)).split()
-        assert returned == variable and returned.startswith(str(tmp_path / "roge_jax" / "programs-"))
+        assert returned == variable and returned.startswith(
+            str(tmp_path / "roge_jax" / "programs-")
+        )
 
     @pytest.mark.parametrize("early", [True, False])
     def test_programs_are_kept_however_small(self, early, tmp_path):
         lines = ["from roge_jax.entry import enable_cache; enable_cache()", "import jax"]
         lines = lines if early else lines[::-1]
-        self.run("; ".join([*lines, "jax.jit(lambda x: x + 1)(2.0)"]), ROGE_CACHE=str(tmp_path), JAX_PLATFORMS="cpu")
+        self.run(
+            "; ".join([*lines, "jax.jit(lambda x: x + 1)(2.0)"]),
+            ROGE_CACHE=str(tmp_path),
+            JAX_PLATFORMS="cpu",
+        )
         assert any(tmp_path.glob("programs-*/*"))
 
     def test_can_be_turned_off_and_jax_setting_wins(self, tmp_path):
@@ -159,11 +170,17 @@ class TestOutputFolder:
     def test_foreign_folders_and_files_are_not_touched(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("precious")
         (tmp_path / "file").write_text("")
-        with pytest.raises(UserError, match=r"not of an earlier run"), entry.output_folder(tmp_path):
+        with (
+            pytest.raises(UserError, match=r"not of an earlier run"),
+            entry.output_folder(tmp_path),
+        ):
             pass
         with pytest.raises(UserError, match="is a file"), entry.output_folder(tmp_path / "file"):
             pass
-        with pytest.raises(UserError, match="cannot be written"), entry.output_folder(tmp_path / "file" / "x"):
+        with (
+            pytest.raises(UserError, match="cannot be written"),
+            entry.output_folder(tmp_path / "file" / "x"),
+        ):
             pass
         assert self.left(tmp_path) == ["file", "thesis.tex"]
 
@@ -197,9 +214,18 @@ class TestRecord:
         import numpy as np
 
         file = tmp_path / "run.json"
-        entry.write_json(file, {"a": float("nan"), "b": np.float32(0.5), "c": np.eye(2), "d": (tmp_path, 1), 3: None})
+        entry.write_json(
+            file,
+            {"a": float("nan"), "b": np.float32(0.5), "c": np.eye(2), "d": (tmp_path, 1), 3: None},
+        )
         content = json.loads(file.read_text(), parse_constant=pytest.fail)
-        assert content == {"a": None, "b": 0.5, "c": [[1, 0], [0, 1]], "d": [str(tmp_path), 1], "3": None}
+        assert content == {
+            "a": None,
+            "b": 0.5,
+            "c": [[1, 0], [0, 1]],
+            "d": [str(tmp_path), 1],
+            "3": None,
+        }
         with pytest.raises(TypeError):
             entry.write_json(file, {"a": object()})
         assert json.loads(file.read_text()) == content

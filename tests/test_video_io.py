@@ -115,7 +115,9 @@ class TestPictures:
         names = video_io.write_frames(tmp_path / "frames", frames)
         assert names == [f"{i:04d}.png" for i in range(5)]
         for name, pixels in zip(names, frames, strict=True):
-            np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "frames" / name)), pixels)
+            np.testing.assert_array_equal(
+                np.asarray(Image.open(tmp_path / "frames" / name)), pixels
+            )
         video_io.write_frames(tmp_path / "frames", frames[:2])
         assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == names[:2]
         assert [p.name for p in tmp_path.iterdir()] == ["frames"]
@@ -147,7 +149,9 @@ class TestPictures:
 
         photos = [plain((200, 0, 0)), plain((0, 200, 0))]
         frames = [plain((0, 0, i)) for i in range(20)]
-        sheet = video_io.contact_sheet({"photos": photos, "generated": frames}, columns=4, min_height=80)
+        sheet = video_io.contact_sheet(
+            {"photos": photos, "generated": frames}, columns=4, min_height=80
+        )
         # 40 pixels are enlarged twice; 4 columns of 120 and five gaps of 4.
         assert sheet.shape == (2 * (20 + 80 + 4) + 4, 4 * 124 + 4, 3)
         assert sheet[60, 30].tolist() == [200, 0, 0] and sheet[60, 160].tolist() == [0, 200, 0]
