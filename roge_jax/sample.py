@@ -115,17 +115,16 @@ def context_ids(text: str | None, scene, most: int) -> list[int]:
     """The views that --context asks for."""
     from .data.scene import select_context
 
-    count = min(len(scene), most, DEFAULT_CONTEXT)
-    if (text is not None and "," in text) or text in scene.names:
+    if text is None:
+        return select_context(scene, min(len(scene), most, DEFAULT_CONTEXT))
+    if "," in text or text in scene.names:
         return [_view(word.strip(), scene) for word in text.split(",") if word.strip()]
-    if text is not None:
-        if not text.isdigit() or not 1 <= int(text) <= min(len(scene), most):
-            raise UserError(
-                f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the model "
-                f"takes {most}), or photos by number or name, separated by commas."
-            )
-        count = int(text)
-    return select_context(scene, count)
+    if not text.isdigit() or not 1 <= int(text) <= min(len(scene), most):
+        raise UserError(
+            f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
+            f"model takes {most}), or photos by number or name, separated by commas."
+        )
+    return select_context(scene, int(text))
 
 
 def _view(word: str, scene) -> int:

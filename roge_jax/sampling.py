@@ -292,7 +292,8 @@ def sample(
     told: list[dict[str, Any]] = []
     evaluations = 0
     for number, (start, stop) in enumerate(runs):
-        kept, chosen = list(range(len(context))), []
+        kept: list[int] = list(range(len(context)))
+        chosen: list[int] = []
         images, recon, contexts = photos.images, photos.recon, context
         if number and settings.long == "chain":
             made = np.concatenate(frames)

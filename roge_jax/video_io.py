@@ -97,7 +97,7 @@ def _write_vp9(file: Path, frames: np.ndarray, fps: float) -> None:
     import cv2
 
     h, w = frames.shape[1:3]
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*"VP90"), fps, (w, h))
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"VP90"), fps, (w, h))
     if not writer.isOpened():
         raise UserError(
             f"{file}: this OpenCV cannot write VP9 either: install PyAV (pip install av)."
@@ -130,7 +130,8 @@ def read_video(path: str | Path) -> np.ndarray:
 def _read_cv2(path: Path) -> list[np.ndarray]:
     import cv2
 
-    capture, frames = cv2.VideoCapture(str(path)), []
+    capture = cv2.VideoCapture(str(path))
+    frames: list[np.ndarray] = []
     while True:
         there, pixels = capture.read()
         if not there:
