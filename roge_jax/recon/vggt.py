@@ -195,6 +195,7 @@ def aggregate(
     if cfg.dino_depth:
         patches, _ = dino(p["patch_encoder"], x, cfg=cfg)
     else:
+        assert plucker is not None, "the linear patch embedding reads rays"
         patches = patch_conv(p["patch_encoder"]["patch_embed"], jnp.concatenate([x, plucker], -1))
     out = {"patch_tokens": patches}
     slot = np.minimum(np.arange(m), 1)  # view 0 is the reference and has tokens of its own
@@ -204,9 +205,9 @@ def aggregate(
     x = jnp.concatenate([camera[:, None], registers, patches], 1)
 
     grid = (h // cfg.patch, w // cfg.patch)
-    angles = grid_angles(*grid, cfg.width // cfg.heads // 2, 100.0, offset=1)
+    table = grid_angles(*grid, cfg.width // cfg.heads // 2, 100.0, offset=1)
     specials = SPECIALS + cfg.registers
-    angles = jnp.concatenate([jnp.zeros((specials, *angles.shape[1:])), jnp.asarray(angles)])
+    angles = jnp.concatenate([jnp.zeros((specials, *table.shape[1:])), jnp.asarray(table)])
 
     def rotate(t, angles):
         row, column = jnp.split(t, 2, axis=-1)

@@ -212,17 +212,18 @@ def train(
         )
     checkpoints = Checkpoints(out / "checkpoints", keep=loop.keep)
     log_path = out / "log.jsonl"
-    if checkpoints.latest() is None:
+    latest = checkpoints.latest()
+    if latest is None:
         if is_main():
             log_path.unlink(missing_ok=True)
     elif resume:
-        _check_fits(checkpoints.folder, checkpoints.latest(), state)
-        state = checkpoints.restore(state)
+        _check_fits(checkpoints.folder, latest, state)
+        state = checkpoints.restore(state, latest)
         if is_main():
             _cut_log(log_path, int(state["step"]))
     else:
         raise UserError(
-            f"{out} holds a run at step {checkpoints.latest()}: continue it with --resume, or choose another folder."
+            f"{out} holds a run at step {latest}: continue it with --resume, or choose another folder."
         )
     step = jax.jit(make_step(objective, optimiser, optim), donate_argnums=0, out_shardings=where)
     key = jax.random.key(loop.seed)
