@@ -318,6 +318,7 @@ def test_the_three_modes_of_context_slots():
 # Diagnostics of joint training.
 
 
+@pytest.mark.slow  # compiles the whole model forwards and twice backwards
 def test_diagnostics_agree_with_the_gradient_of_the_loss():
     trainable, frozen = parts()
     run = diagnose.joint_diagnose(CONFIG, bins=4)
