@@ -182,7 +182,7 @@ def load_adapter(folder: str | Path) -> tuple[Tree, RoGeConfig]:
 
     folder = Path(folder)
     if not (folder / ADAPTER).exists():
-        raise UserError(f"{folder} holds no {ADAPTER}: give a folder that training wrote as `adapter`.")
+        raise UserError(f"{folder} holds no {ADAPTER}: give a folder written by `save_adapter`.")
     config = load_config(folder)
     try:
         tree = unflatten(load_file(folder / ADAPTER))

@@ -121,7 +121,8 @@ def make_plan(args: argparse.Namespace):
     if args.framecrafter:
         framecrafter = open_source(args.framecrafter)
         published.expect(framecrafter, ("lora",), "--framecrafter", "FrameCrafter's LoRA file")
-    vae = open_source(args.wan_vae or vae_path) if (args.wan_vae or vae_path) else None
+    vae_path = args.wan_vae or vae_path
+    vae = open_source(vae_path) if vae_path else None
 
     config = choose_config(args.preset, wan, recon)
     _require(args, config, wan, vae, recon)
@@ -193,9 +194,9 @@ def choose_config(name: str | None, wan, recon):
         chosen = config.preset(same[0]) if same else dataclasses.replace(chosen, name="custom", dit=dit)
     if recon is not None:
         encoder, renderer = published.recon_config(recon)
-        found_recon = {"encoder": encoder} | ({"renderer": renderer} if renderer else {})
-        if any(getattr(chosen, part) != cfg for part, cfg in found_recon.items()):
-            chosen = dataclasses.replace(chosen, name="custom", **found_recon)
+        renderer = renderer or chosen.renderer
+        if (chosen.encoder, chosen.renderer) != (encoder, renderer):
+            chosen = dataclasses.replace(chosen, name="custom", encoder=encoder, renderer=renderer)
     return chosen
 
 

@@ -6,7 +6,7 @@
     --style framecrafter     ... for FrameCrafter and DiffSynth-Studio
     --style comfyui          ... for ComfyUI
 
-Training writes ADAPTER. Merging streams: memory stays at a few layers of the model.
+ADAPTER is a folder that `checkpoint.save_adapter` wrote. Merging streams: memory stays at a few layers of the model.
 """
 
 import argparse
@@ -138,7 +138,7 @@ def write_lora(tree, config, style: str, out: Path) -> None:
     flat = {p: np.asarray(x) for p, x in flatten(tree.get("dit", {})).items() if p.endswith(("lora_a", "lora_b"))}
     if not flat:
         raise UserError("The adapter holds no LoRA of the transformer: only --merge can export it.")
-    tensors = export_lora(unflatten(flat), style=style)
+    tensors = export_lora(unflatten(flat), style=style)  # type: ignore[arg-type]
     part = check_output(out)
     part.mkdir(parents=True, exist_ok=True)
     save_file(tensors, part / FILES[style], metadata={"format": "pt"})

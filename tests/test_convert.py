@@ -113,14 +113,13 @@ def test_diffusers_layout_and_bfloat16_source(files, tmp_path, prefix):
     tensors[f"{prefix}blocks.0.attn2.norm_added_q.weight"] = np.ones(128, np.float32)  # read by nobody
     made.save_sharded(tmp_path / "repo" / "transformer", tensors)
     made.save(tmp_path / "repo" / "vae" / "diffusion_pytorch_model.safetensors", made.vae_tensors(names="diffusers")[1])
-    run("--wan", tmp_path / "repo", "--preset", files["config"], "--random", "encoder", "renderer",
+    run("--wan", tmp_path / "repo", "--preset", files["config"], "--lagernvs", files["lagernvs"],
         "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
     got = stored(tmp_path / "m")
     for path, value in tree.items():
         np.testing.assert_array_equal(got[f"dit/{path}"], value.astype(BF16).astype(np.float32), err_msg=path)
     for path, value in made.vae_tensors()[0].items():
         np.testing.assert_array_equal(got[f"vae/{path}"], value)
-    assert got["renderer/ray_embed/kernel"].std() > 0
 
 
 def test_text_to_video_is_widened_with_zeros(tmp_path, capsys):
@@ -156,16 +155,19 @@ def test_vggt_alone_fills_the_aggregator(files, tmp_path):
     assert "prompt/rows" in initialised
 
 
-def test_initialised_leaves_are_those_of_a_fresh_model(files, tmp_path):
+def test_initialised_leaves_are_those_of_a_fresh_model(files, monkeypatch):
+    """One leaf of each kind: the values do not depend on which others there are."""
     import jax
 
-    made.save(tmp_path / "model.safetensors", made.vggt_tensors()[1])
-    run("--vggt", tmp_path / "model.safetensors", "--random", "dit", "vae", "--preset", files["config"],
-        "--dtype", "float32", "--out", tmp_path / "m", "--seed", 5)  # fmt: skip
+    arguments = ["--lagernvs", files["lagernvs"], "--random", "dit", "vae", "--preset", files["config"], "--seed", 5]
+    plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in arguments]))
+    paths = ["dit/blocks/ffn/fc1/kernel", "fusion/geometry_adapter/kernel", "vae/decoder/conv_in/kernel"]
+    chosen = params.unflatten({path: plan.specs[path] for path in paths})
+    monkeypatch.setattr(model, "specs", lambda config: chosen)  # or initialising takes a minute of compiling
     fresh = params.flatten(model.init(jax.random.key(5), CONFIG))
-    got = stored(tmp_path / "m")
-    for path in ("dit/blocks/ffn/fc1/kernel", "encoder/connector/kernel", "vae/decoder/conv_in/kernel"):
-        np.testing.assert_array_equal(got[path], fresh[path], err_msg=path)
+    for path in paths:
+        np.testing.assert_array_equal(importer.initial_leaf(path, plan), fresh[path], err_msg=path)
+        assert path in plan.initialised and np.std(fresh[path]) > 0
 
 
 def framecrafter(cfg, seed=7, rank=2):
@@ -231,13 +233,13 @@ def test_prompt_rows_from_a_umt5_encoder(tmp_path):
         vocab_size=8, d_model=8, d_kv=4, d_ff=16, num_layers=2, num_heads=2, feed_forward_proj="gated-gelu"
     )
     torch.manual_seed(0)
-    net = transformers.UMT5EncoderModel(config).to(torch.bfloat16).eval()
+    net = transformers.UMT5EncoderModel(config).to(torch.bfloat16).float().eval()
     net.save_pretrained(tmp_path / "text_encoder")
     for text, ids in (("", [1]), ("  a\n room &amp;amp; ", [3, 4, 2, 1])):
         rows = encode_prompt(tmp_path, text, CONFIG.dit)
-        inputs = {"input_ids": torch.tensor([ids]), "attention_mask": torch.ones(1, len(ids), dtype=torch.long)}
-        want = net(**inputs).last_hidden_state[0].float().detach().numpy()
-        np.testing.assert_array_equal(rows[: len(ids)], want)
+        want = net(input_ids=torch.tensor([ids])).last_hidden_state[0].detach().numpy()
+        # The encoder runs in bfloat16 (2^-9 per rounding, a dozen in a row); the reference is float32.
+        assert np.linalg.norm(rows[: len(ids)] - want) < 12 * 2.0**-9 * np.linalg.norm(want)
         assert rows.shape == (6, 8) and not rows[len(ids) :].any()
     with pytest.raises(UserError, match="no umT5 encoder and tokenizer there"):
         encode_prompt(tmp_path / "tokenizer", "", CONFIG.dit)

@@ -60,7 +60,8 @@ def plan_shards(
     for shard, paths in enumerate(groups):
         # Wide types first: every tensor then starts at a multiple of its element.
         paths = sorted(paths, key=lambda path: (-np.dtype(leaves[path][1]).itemsize, path))
-        entries, end = {}, 0
+        entries: dict[str, dict] = {}
+        end = 0
         for path in paths:
             shape, dtype = leaves[path]
             begin, end = end, end + math.prod(shape) * np.dtype(dtype).itemsize

@@ -15,6 +15,7 @@ import collections
 import io
 import json
 import math
+import operator
 import pickle
 import struct
 import zipfile
@@ -177,7 +178,7 @@ def _stored(file: Path, base: int, key: str, entry: dict) -> Stored:
     if entry["dtype"] not in DTYPES:
         raise UserError(f"{file}: tensor '{key}' has dtype {entry['dtype']}, which cannot be read.")
     begin, end = entry["data_offsets"]
-    stored = Stored(file, base + begin, tuple(entry["shape"]), DTYPES[entry["dtype"]])
+    stored = Stored(file, base + begin, tuple(map(operator.index, entry["shape"])), DTYPES[entry["dtype"]])
     if begin < 0 or min(stored.shape, default=0) < 0 or end - begin != stored.nbytes:
         raise UserError(f"{file}: tensor '{key}' of shape {stored.shape} does not fill its {end - begin} bytes.")
     return stored
@@ -243,7 +244,7 @@ def _indexed(index: Path) -> dict[str, Stored]:
 class _Storage(NamedTuple):
     offset: int
     dtype: np.dtype
-    count: int  # elements
+    elements: int
 
 
 def read_torch_header(file: Path) -> dict[str, Stored]:
@@ -301,7 +302,7 @@ class _Unpickler(pickle.Unpickler):
         known = {
             ("collections", "OrderedDict"): collections.OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): lambda *args: self._tensor(*args[:4]),
-            ("torch._utils", "_rebuild_tensor_v3"): lambda *args: self._typed(*args[:4], args[6]),
+            ("torch._utils", "_rebuild_tensor_v3"): lambda *args: self._typed(args[0], args[1], args[2], args[3], args[6]),
             ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
             ("torch", "Size"): lambda sizes=(): tuple(sizes),
         }
@@ -339,16 +340,18 @@ class _Unpickler(pickle.Unpickler):
     def _typed(self, storage: _Storage, start: int, shape, strides, dtype: str) -> Stored:
         """Kinds of numbers younger than PyTorch's typed storages: their storage counts bytes."""
         kind = DTYPES[dtype]
-        count = storage.count * storage.dtype.itemsize // kind.itemsize
-        return self._tensor(_Storage(storage.offset, kind, count), start, shape, strides)
+        elements = storage.elements * storage.dtype.itemsize // kind.itemsize
+        return self._tensor(_Storage(storage.offset, kind, elements), start, shape, strides)
 
     def _tensor(self, storage: _Storage, start: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> Stored:
         shape, strides = tuple(map(int, shape)), tuple(map(int, strides))
         last = sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
         inside = start >= 0 and min((*shape, *strides), default=0) >= 0
-        if not inside or (math.prod(shape) and start + last >= storage.count):
+        if not inside or (0 not in shape and start + last >= storage.elements):
             raise UserError(f"{self.file} is damaged: a tensor of shape {shape} reaches outside its storage.")
-        contiguous = tuple(math.prod(shape[i + 1 :]) for i in range(len(shape)))
-        plain = all(n == 1 or s == c for n, s, c in zip(shape, strides, contiguous, strict=True))
+        contiguous = [1]  # from the last axis on; Python's integers do not overflow
+        for n in shape[:0:-1]:
+            contiguous.insert(0, n * contiguous[0])
+        plain = all(n == 1 or s == c for n, s, c in zip(shape, strides, contiguous))
         offset = storage.offset + start * storage.dtype.itemsize
         return Stored(self.file, offset, shape, storage.dtype, None if plain else strides)
