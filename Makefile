@@ -8,6 +8,7 @@ RUN := $(VENV)/bin/python
 BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
+CODE := roge_jax tests experiments
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal -q
 
 .DEFAULT_GOAL := help
@@ -41,13 +42,13 @@ test-parity: $(PARITY)  ## tests against PyTorch implementations (installs torch
 check: lint test  ## what CI runs
 
 lint: $(DEV)  ## ruff and mypy, nothing is changed
-	$(VENV)/bin/ruff check .
-	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/ruff check $(CODE)
+	$(VENV)/bin/ruff format --check $(CODE)
 	$(VENV)/bin/mypy
 
 format: $(DEV)  ## let ruff order imports and lay out the code
-	$(VENV)/bin/ruff check --fix .
-	$(VENV)/bin/ruff format .
+	$(VENV)/bin/ruff check --fix $(CODE)
+	$(VENV)/bin/ruff format $(CODE)
 
 figures: $(DEV)  ## every experiment again; writes experiments/results (long)
 	@for f in experiments/*.py; do echo "== $$f"; $(RUN) $$f || exit 1; done
