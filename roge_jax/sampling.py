@@ -308,9 +308,11 @@ def sample(
         views = window_views(images, recon, contexts, target[start:stop], info, config)
         m = len(contexts)
         if m not in cache:
+            bar.set_description("compiling")
             with stage("compile"):
                 cache[m] = programs(params, views, config, settings.slots)
         run = cache[m]
+        bar.set_description("sampling")
         with stage("prepare"):
             prepared = jax.block_until_ready(run.prepare(params, views))
             noise = jnp.asarray(draw_noise(settings.seed, number, m, config))
