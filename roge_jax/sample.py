@@ -22,6 +22,7 @@ from .entry import Clock, environment, number, one_of, output_folder, run, write
 from .errors import UserError, did_you_mean
 
 DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
+TRAJECTORY = "orbit:degrees=12"  # gentle: two photos side by side show little of the rest
 DTYPES = ("auto", "float32", "bfloat16")
 LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
 
@@ -49,7 +50,7 @@ def parser() -> argparse.ArgumentParser:
     path_help = (
         f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false"
     )
-    option("--trajectory", path_help, "orbit", metavar="NAME|FILE")
+    option("--trajectory", path_help, TRAJECTORY, metavar="NAME|FILE")
     option("--frames", "length of the path; the model's window, or the file's own", type=number(1))
     option("--steps", "sampling steps", STEPS, type=number(1))
     option("--solver", ", ".join(SOLVERS), SOLVER, type=one_of(SOLVERS))
