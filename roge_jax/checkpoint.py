@@ -141,7 +141,8 @@ def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig
         except SafetensorError as error:
             raise UserError(f"{file} is truncated or not a safetensors file ({error}): copy it again.") from error
     if dtype is not None:
-        flat = {k: v.astype(dtype) if jnp.issubdtype(v.dtype, jnp.floating) else v for k, v in flat.items()}
+        # In NumPy: JAX would compile a conversion for every shape.
+        flat = {k: jnp.asarray(_cast(np.asarray(v), dtype)) for k, v in flat.items()}
     params = unflatten(flat)
     check(params, model.specs(config), source=str(folder))
     return params, config
@@ -220,6 +221,10 @@ def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
     a, b = (shape, other) if leaf == "lora_a" else (other, shape)
     head, rank = kernel.shape[:lead], a[-1]
     return a == (*head, int(np.prod(ins)), rank) and b == (*head, rank, d_out)
+
+
+def _cast(x: np.ndarray, dtype) -> np.ndarray:
+    return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 def load_config(folder: Path) -> RoGeConfig:

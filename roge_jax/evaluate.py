@@ -70,14 +70,17 @@ def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) ->
     from .data import scene as scenes
 
     if name.startswith("procedural:"):
-        from .data.procedural import sample_sequence
+        from .data.procedural import SWEEP, sample_sequence
 
         seed = name.removeprefix("procedural:")
         if not seed.isdigit():
             raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.")
-        options = {} if sweep is None else {"sweep": tuple(sweep)}
         made = sample_sequence(
-            int(seed), frames=frames + contexts, height=size[0], width=size[1], **options
+            int(seed),
+            frames=frames + contexts,
+            height=size[0],
+            width=size[1],
+            sweep=SWEEP if sweep is None else tuple(sweep),
         )
         context, target = spread(frames + contexts, contexts, frames)
         order = context + target
@@ -169,7 +172,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         m = len(scene["context"])
         truth = scene["rgb"][m:]
         videos = evaluator.videos(scene)
-        simple, depths = baselines(
+        simple, _ = baselines(
             scene["rgb"][:m], scene["K"][:m], scene["c2w"][:m], scene["K"][m:], scene["c2w"][m:], size, scene["depth"]
         )
         row = {

@@ -67,7 +67,8 @@ def condition(
 ) -> Condition:
     """All of C = {Y, P, G}; plucker [m + n, h, w, 6] at generation size, features [m + n, gh, gw, d]."""
     rays = ray_condition(plucker, contexts)
-    geometry = geometry_condition(p, features, rays.shape[1:3], contexts)
+    lh, lw = rays.shape[1:3]
+    geometry = geometry_condition(p, features, (lh, lw), contexts)
     tokens = patch_conv(p["rays_embed"], rays) + patch_conv(p["geometry_embed"], geometry)
     return Condition(appearance(context_latents, rays.shape[0]), tokens.reshape(-1, tokens.shape[-1]))
 

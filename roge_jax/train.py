@@ -66,7 +66,7 @@ class ProceduralSource:
     """Endless sequences rendered when they are asked for; item i is scene seed i of the training split."""
 
     def __init__(self, height: int, width: int, frames: int):
-        self.settings = {"height": height, "width": width, "frames": frames}
+        self.height, self.width, self.frames = height, width, frames
 
     def __len__(self) -> int:
         return 10**9  # held-out seeds begin here
@@ -74,7 +74,9 @@ class ProceduralSource:
     def __getitem__(self, index: int) -> dict:
         from .data.procedural import sample_sequence
 
-        return sample_sequence(index, **self.settings)
+        return sample_sequence(
+            index, height=self.height, width=self.width, frames=self.frames, depth=False
+        )
 
 
 def main(args: argparse.Namespace) -> None:

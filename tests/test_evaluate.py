@@ -50,6 +50,6 @@ def test_contexts_are_spread_and_targets_are_the_rest():
 
 @pytest.mark.parametrize("spec", ["procedural:5..2", "procedural:a..b"])
 def test_a_wrong_range_of_seeds_is_named(spec):
-    with pytest.raises(UserError, match="FIRST..LAST"):
+    with pytest.raises(UserError, match="FIRST"):
         evaluate.expand([spec])
     assert evaluate.expand(["procedural:3..4", "x"]) == ["procedural:3", "procedural:4", "x"]

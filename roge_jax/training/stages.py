@@ -203,8 +203,11 @@ def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: 
     """evaluate(trainable) -> the stage's own terms on held-out procedural scenes, prefixed `held_`."""
     from ..data.procedural import HELDOUT_SEED, sample_sequence
 
-    size = {"height": config.height, "width": config.width, "frames": max(24, config.frames + 3)}
-    pool = [sample_sequence(HELDOUT_SEED + i, **size) for i in range(scenes)]
+    frames = max(24, config.frames + 3)
+    pool = [
+        sample_sequence(HELDOUT_SEED + i, frames=frames, height=config.height, width=config.width)
+        for i in range(scenes)
+    ]
     views = dataclasses.replace(
         stage.views, contexts=(3,), context_weights=(1.0,), augment=False, near=0.0, size=None
     )
