@@ -8,13 +8,14 @@ Random weights, inputs of zeros and noise; bfloat16 matrices on a GPU, float32 o
 calls to warm up, then the median and quartiles of ten. FLOPs are those of `roge_jax.cost`. A row that was not run says
 "not measured", one that did not fit "out of memory". Goals are for one H100 or H200 (seconds). The peer is diffusers'
 `WanTransformer3DModel` in the same process (compiled on a GPU, scaled_dot_product_attention), if torch and diffusers
-are there. The paper states no times. Writes experiments/results/real_size.json and prints a table.
+are there; it computes the keys and values of the text in every call, which ours caches (1.5 % of the 192x336 forward). The paper states no times. Writes experiments/results/real_size.json and prints a table.
 """
 
 import argparse
 import dataclasses
 import functools
 import json
+import os
 import time
 from pathlib import Path
 
@@ -46,10 +47,25 @@ def cases():
     paper, mini = config.preset("paper"), config.preset("mini")
     large = dataclasses.replace(paper, height=480, width=832)
     ten = dataclasses.replace(paper, recon_height=336, recon_width=520)
-    sizes = [(paper, 6), (large, 6), (paper, 6), (large, 6), (ten, 10), (paper, 6), (large, 6), (paper, 6)]
+    sizes = [
+        (paper, 6),
+        (large, 6),
+        (paper, 6),
+        (large, 6),
+        (ten, 10),
+        (paper, 6),
+        (large, 6),
+        (paper, 6),
+    ]
     for width, depth in ((128, 4), (256, 6), (384, 8)):
         dit = dataclasses.replace(
-            mini.dit, width=width, heads=width // 64, depth=depth, ffn=4 * width, text_dim=64, text_len=16
+            mini.dit,
+            width=width,
+            heads=width // 64,
+            depth=depth,
+            ffn=4 * width,
+            text_dim=64,
+            text_len=16,
         )
         sizes.append((dataclasses.replace(mini, dit=dit), 3))
     sizes += [(mini, 3)] * 3
@@ -67,7 +83,9 @@ def weights(specs, dtype):
     base = 0.02 * jax.random.normal(jax.random.key(0), (1 << 16,))
     fill = jax.jit(lambda shape, kind: jnp.resize(base, shape).astype(kind), static_argnums=(0, 1))
     flat = flatten(specs)
-    return unflatten({p: fill(s.shape, jnp.float32 if keeps_float32(p) else dtype) for p, s in flat.items()})
+    return unflatten(
+        {p: fill(s.shape, jnp.float32 if keeps_float32(p) else dtype) for p, s in flat.items()}
+    )
 
 
 def measure(call, repeats: int) -> dict:
@@ -127,7 +145,9 @@ def program(group: str, cfg, m: int, dtype):
         if group == "dit":
 
             def forward(params, x, cond, text):
-                return model.velocity(params, x, jnp.float32(0.5), cond, config=cfg, contexts=m, text=text)
+                return model.velocity(
+                    params, x, jnp.float32(0.5), cond, config=cfg, contexts=m, text=text
+                )
 
             return forward, (params, noise, cond, text), flops
 
@@ -232,6 +252,8 @@ def peer(name: str, repeats: int, gpu: bool) -> dict | None:
         return None
     from roge_jax import cost
 
+    if not gpu:
+        torch.set_num_threads(len(os.sched_getaffinity(0)))
     cfg, m = cases()[name]
     d, (lh, lw), slots = cfg.dit, cfg.latent_size, cfg.slots(m)
     image = {"image_dim": d.clip_dim, "added_kv_proj_dim": d.width} if d.clip_dim else {}
@@ -258,7 +280,9 @@ def peer(name: str, repeats: int, gpu: bool) -> dict | None:
     text = torch.randn(1, d.text_len, d.text_dim, device=device, dtype=kind)
     extra = {}
     if d.clip_dim:
-        extra["encoder_hidden_states_image"] = torch.randn(1, d.clip_rows, d.clip_dim, device=device, dtype=kind)
+        extra["encoder_hidden_states_image"] = torch.randn(
+            1, d.clip_rows, d.clip_dim, device=device, dtype=kind
+        )
     step = torch.tensor([500.0], device=device)
 
     def call():

@@ -143,9 +143,9 @@ def bfloat16_curves():
 
 def stability_curves():
     """Largest growth of a decaying mode in one step (one-step methods) at stiffness z = h |rate|."""
-    z = np.geomspace(0.1, 20, 200)
+    z = np.geomspace(0.1, 80, 300)
     curves = {}
-    for name in ("euler", "midpoint", "heun", "rk4", "rkc2"):
+    for name in ("euler", "midpoint", "heun", "rk4", "rkc2", "rkc2_8"):
         table = tabulate(name, np.array([1.0, 0.9]))  # does not end at 0: no special last step
         growth = [abs(float(walk(table, lambda x, s, r=r: r * x, np.ones(1))[0])) for r in z / 0.1]
         limit = float(z[np.argmax(np.array(growth) > 1 + 1e-9)])

@@ -42,7 +42,9 @@ def held(specs: dict, mesh: AbstractMesh, item) -> float:
     total = 0.0
     for path, spec in flatten(specs).items():
         split = sharding.partition(spec.axes, spec.shape, mesh, leaf=path)
-        over = [a for entry in split if entry for a in ((entry,) if isinstance(entry, str) else entry)]
+        over = [
+            a for entry in split if entry for a in ((entry,) if isinstance(entry, str) else entry)
+        ]
         total += math.prod(spec.shape) / math.prod([mesh.shape[a] for a in over]) * item(path)
     return total
 
@@ -65,7 +67,9 @@ def shares(cfg: config.RoGeConfig, m: int, *, recon_trains: bool) -> dict[str, f
     scene = m * rows * columns
     d = cfg.dit
     forward = cost.velocity(d, tokens)
-    attend = d.depth * (cost.attention(tokens, tokens, d.width) + cost.attention(tokens, d.text_len, d.width))
+    attend = d.depth * (
+        cost.attention(tokens, tokens, d.width) + cost.attention(tokens, d.text_len, d.width)
+    )
     recon = cost.encoder(cfg.encoder, *size, m, cfg.renderer.width)
     recon += cost.renderer(cfg.renderer, *size, scene, m, v)
     vae = m * cost.vae_encode(cfg.vae, 1, cfg.height, cfg.width)
@@ -86,7 +90,9 @@ def shares(cfg: config.RoGeConfig, m: int, *, recon_trains: bool) -> dict[str, f
     }
 
 
-def activations(cfg: config.RoGeConfig, m: int, seq: int, *, recon_trains: bool) -> dict[str, float]:
+def activations(
+    cfg: config.RoGeConfig, m: int, seq: int, *, recon_trains: bool
+) -> dict[str, float]:
     """Bytes on one device for one scene shared by `seq` devices, float32 between the matrix products.
 
     The stages follow one another: the peak is the largest, not the sum, plus `kept`, which lives through the step.
@@ -94,14 +100,17 @@ def activations(cfg: config.RoGeConfig, m: int, seq: int, *, recon_trains: bool)
     n = shares(cfg, m, recon_trains=recon_trains)
     d, r, e = cfg.dit, cfg.renderer, cfg.encoder
     tokens = math.ceil(n["tokens"] / seq)
-    block = tokens * 4.0 * (12 * d.width + 3 * d.ffn)  # forward and backward of one block, recomputed
+    block = (
+        tokens * 4.0 * (12 * d.width + 3 * d.ffn)
+    )  # forward and backward of one block, recomputed
     rays = (cfg.recon_height // r.patch) * (cfg.recon_width // r.patch)
     chunk = math.ceil(r.chunk / seq)
     carry = 4.0 * chunk * (rays + r.registers + n["scene_tokens"]) * r.width
     seen = n["scene_tokens"] + m * (SPECIALS + e.registers)
     encoder = 4.0 * seen * e.width * (2 * e.depth + e.dino_depth + 20)
     return {
-        "kept": 4.0 * n["views"] * rays * r.width + 4.0 * n["tokens"] * d.patch**2 * (24 * 64 + 4 * 384),
+        "kept": 4.0 * n["views"] * rays * r.width
+        + 4.0 * n["tokens"] * d.patch**2 * (24 * 64 + 4 * 384),
         "dit_full": d.depth * tokens * 4.0 * d.width + block,
         "dit_dots": d.depth * tokens * 4.0 * (7 * d.width + d.ffn) + block,
         "renderer": carry * (r.depth + 12 if recon_trains else 12),
@@ -119,7 +128,9 @@ def communication(cfg: config.RoGeConfig, m: int, sizes, *, recon_trains: bool) 
     passes = 2  # forward; backward, which recomputes with the same gathered block
     d = cfg.dit
     each = n["tokens"] / seq * d.width * (seq - 1) / seq
-    layer = each * (3 * 2 + 4) + each * (2 + 4)  # q, k, v and the result of self-attention; q and result of cross
+    layer = each * (3 * 2 + 4) + each * (
+        2 + 4
+    )  # q, k, v and the result of self-attention; q and result of cross
     replicas, trained = data * seq, 4.0 * count(trains)
     rays = n["views"] * (cfg.recon_height // 8) * (cfg.recon_width // 8)
     return {
@@ -177,7 +188,8 @@ def layout_table(title: str, rows: dict[int, list[dict]]) -> list[str]:
                 str(gpus),
                 ", ".join(map(str, x["mesh"].values())),
                 str(x["batch"]),
-                f"{x['weights'] / GB:.1f}" + (f" + {x['gathered_blocks'] / GB:.1f}" if x["gathered_blocks"] else ""),
+                f"{x['weights'] / GB:.1f}"
+                + (f" + {x['gathered_blocks'] / GB:.1f}" if x["gathered_blocks"] else ""),
                 f"{x['state'] / GB:.1f}",
                 f"{kept[0] / GB:.0f} / {kept[1] / GB:.0f}",
                 f"{x['total_full'] / GB:.0f} / {x['total_dots'] / GB:.0f}",
@@ -194,9 +206,13 @@ def growth() -> tuple[list[dict], list[str]]:
     """FLOPs and bytes of one scene against M, N and resolution, one device, relative to the first row of each group."""
     cases = {
         "photos M, 81 frames at 192x336": [((192, 336, 81), m) for m in (3, 4, 5, 6, 7, 8, 9)],
-        "photos M, 81 frames at 480x832 (reconstruction frozen)": [((480, 832, 81), m) for m in (3, 6, 9)],
+        "photos M, 81 frames at 480x832 (reconstruction frozen)": [
+            ((480, 832, 81), m) for m in (3, 6, 9)
+        ],
         "frames N, M = 6 at 192x336": [((192, 336, n), 6) for n in (81, 101, 121, 141, 161)],
-        "size, M = 6, 81 frames": [((h, w, 81), 6) for h, w in ((192, 336), (288, 512), (384, 672), (480, 832))],
+        "size, M = 6, 81 frames": [
+            ((h, w, 81), 6) for h, w in ((192, 336), (288, 512), (384, 672), (480, 832))
+        ],
     }
     rows = []
     lines = [
@@ -209,9 +225,17 @@ def growth() -> tuple[list[dict], list[str]]:
             cfg, trains = sized(*size), "frozen" not in title
             n = shares(cfg, m, recon_trains=trains)
             live = activations(cfg, m, 1, recon_trains=trains)
-            peak = live["kept"] + max(live["dit_full"], live["renderer"], live["encoder"], live["vae"])
+            peak = live["kept"] + max(
+                live["dit_full"], live["renderer"], live["encoder"], live["vae"]
+            )
             first = first or n["step"]
-            label = f"M = {m}" if "photos" in title else f"N = {size[2]}" if "frames N" in title else f"{size[0]}x{size[1]}"
+            label = (
+                f"M = {m}"
+                if "photos" in title
+                else f"N = {size[2]}"
+                if "frames N" in title
+                else f"{size[0]}x{size[1]}"
+            )
             rows.append({"group": title, "case": label, "activations": peak} | n)
             forward = (n["forward"] + n["recon"]) / 1e12
             lines.append(
@@ -224,11 +248,22 @@ def growth() -> tuple[list[dict], list[str]]:
 def main() -> None:
     jax.config.update("jax_platforms", "cpu")
     first, second = sized(192, 336), sized(480, 832)
-    results = {"source": "arithmetic from the parameter specs; nothing in this file was measured", "layouts": {}}
+    results = {
+        "source": "arithmetic from the parameter specs; nothing in this file was measured",
+        "layouts": {},
+    }
     lines = []
     for title, cfg, trains in (
-        ("First stage: 192x336, 81 frames, M = 6, LoRA on both halves; GB per GPU, per step", first, True),
-        ("Second stage: 480x832, 81 frames, M = 6, reconstruction frozen; GB per GPU, per step", second, False),
+        (
+            "First stage: 192x336, 81 frames, M = 6, LoRA on both halves; GB per GPU, per step",
+            first,
+            True,
+        ),
+        (
+            "Second stage: 480x832, 81 frames, M = 6, reconstruction frozen; GB per GPU, per step",
+            second,
+            False,
+        ),
     ):
         found = {
             gpus: [layout(cfg, 6, sizes, recon_trains=trains) for sizes in meshes]

@@ -153,8 +153,8 @@ def draw(records, notes, path):
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    colours = plt.get_cmap("tab10").colors
-    markers = "osD^v<>Phx"
+    colours = [*plt.get_cmap("tab10").colors, (0, 0, 0)]
+    markers = "osD^v<>PhXx"
     fig, axes = plt.subplots(2, 3, figsize=(15, 9.2), sharey="col")
     for column, (name, note) in enumerate(notes.items()):
         mine = [r for r in records if r["problem"] == name]
@@ -162,7 +162,7 @@ def draw(records, notes, path):
         bottom = max(min(good) / 5, note["self_error"] / 3)
         top = 3.0
         samples = 1 if name == "stiff" else SAMPLES
-        time_label = f"milliseconds for {samples} samples, fastest of {REPEATS}, bar to median"
+        time_label = f"milliseconds for {samples} sample{'s' * (samples > 1)}, fastest of {REPEATS}, bar to median"
         for row, (work, label) in enumerate(
             [
                 (lambda r: r["evaluations"], "velocity evaluations"),
@@ -230,20 +230,20 @@ def draw(records, notes, path):
             ax.grid(True, which="major", alpha=0.25)
             if row == 0:
                 ax.set_title(note["title"])
-                triangles(ax, bottom)
+                triangles(ax, bottom, 1.15 * min(r["evaluations"] for r in mine))
             if column == 0:
                 ax.set_ylabel("relative L2 error (median, quartiles)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     handles.append(plt.Line2D([], [], color="k", lw=3.5, alpha=0.22))
-    fig.legend(handles, [*labels, "Pareto front"], loc="lower center", ncol=11, frameon=False)
+    fig.legend(handles, [*labels, "Pareto front"], loc="lower center", ncol=12, frameon=False)
     fig.tight_layout(rect=(0, 0.035, 1, 1))
     fig.savefig(path, dpi=90)
     plt.close(fig)
 
 
-def triangles(ax, bottom):
+def triangles(ax, bottom, x0):
     """Slopes 1, 2 and 4, in the lower left corner."""
-    x0, x1 = 2.2, 5.0
+    x1 = 2.3 * x0
     y0 = bottom * 6
     for order in (1, 2, 4):
         ax.plot([x0, x1], [y0 * (x1 / x0) ** order, y0], color="0.35", lw=1)

@@ -21,7 +21,17 @@ _PUBLIC = {
     "make_path": ("geometry.trajectories", "make_path"),
     "UserError": ("errors", "UserError"),
 }
-_MODULES = ("model", "config", "checkpoint", "fusion", "geometry", "recon", "video", "data", "metrics")
+_MODULES = (
+    "model",
+    "config",
+    "checkpoint",
+    "fusion",
+    "geometry",
+    "recon",
+    "video",
+    "data",
+    "metrics",
+)
 
 __all__ = ["__version__", *_MODULES, *_PUBLIC]
 

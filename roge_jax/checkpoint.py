@@ -48,7 +48,8 @@ class Checkpoints:
         """The state of `step` (default: the latest) with the structure, dtypes and shardings of `like`."""
         step = self.latest() if step is None else step
         abstract = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(x, "sharding", None)), like
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=getattr(x, "sharding", None)),
+            like,
         )
         try:
             return self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
@@ -64,7 +65,12 @@ class Checkpoints:
 
 
 def save_model(
-    folder: Path, params: Tree, config: RoGeConfig, *, dtype=jnp.bfloat16, provenance: dict | None = None
+    folder: Path,
+    params: Tree,
+    config: RoGeConfig,
+    *,
+    dtype=jnp.bfloat16,
+    provenance: dict | None = None,
 ) -> None:
     """Write a model folder. Floating leaves are stored in `dtype`; an existing model there is replaced whole."""
     from safetensors.flax import save_file
@@ -100,13 +106,17 @@ def find_model(name: str | Path) -> Path:
     folder = Path(name)
     if (folder / "config.json").exists():
         return folder
-    places = [ASSETS] + ([Path(os.environ[WEIGHTS_VARIABLE])] if WEIGHTS_VARIABLE in os.environ else [])
+    places = [ASSETS] + (
+        [Path(os.environ[WEIGHTS_VARIABLE])] if WEIGHTS_VARIABLE in os.environ else []
+    )
     for place in places:
         if (place / str(name) / "config.json").exists():
             return place / str(name)
     known = [p.parent.name for place in places for p in place.glob("*/config.json")]
     if folder.exists():
-        raise UserError(f"{folder} has no config.json: give a folder written by roge_jax.convert or train.")
+        raise UserError(
+            f"{folder} has no config.json: give a folder written by roge_jax.convert or train."
+        )
     if str(name) in PRESETS:
         raise UserError(
             f"No trained weights of preset '{name}' are here: convert the official ones with "
@@ -126,20 +136,26 @@ def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig
     folder = find_model(name)
     config = load_config(folder)
     if (folder / ADAPTER).exists():
-        raise UserError(f"{folder} is an adapter: `python -m roge_jax.export {folder} --merge BASE` makes a model of it.")
+        raise UserError(
+            f"{folder} is an adapter: `python -m roge_jax.export {folder} --merge BASE` makes a model of it."
+        )
     files = sorted(folder.glob("model-*.safetensors"))
     expected = int(files[0].stem.rsplit("-", 1)[1]) if files else 1
     if len(files) != expected:
         have = {f.name for f in files}
         lost = [f"model-{i:05d}-of-{expected:05d}.safetensors" for i in range(1, expected + 1)]
         lost = [f for f in lost if f not in have] or ["model-*.safetensors"]
-        raise UserError(f"{folder} is incomplete: {', '.join(lost)} missing. Copy the whole folder again.")
+        raise UserError(
+            f"{folder} is incomplete: {', '.join(lost)} missing. Copy the whole folder again."
+        )
     flat: dict[str, jax.Array] = {}
     for file in files:
         try:
             flat |= load_file(file)
         except SafetensorError as error:
-            raise UserError(f"{file} is truncated or not a safetensors file ({error}): copy it again.") from error
+            raise UserError(
+                f"{file} is truncated or not a safetensors file ({error}): copy it again."
+            ) from error
     if dtype is not None:
         # In NumPy: JAX would compile a conversion for every shape.
         flat = {k: jnp.asarray(_cast(np.asarray(v), dtype)) for k, v in flat.items()}
@@ -148,7 +164,9 @@ def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig
     return params, config
 
 
-def save_adapter(folder: Path, tree: Tree, config: RoGeConfig, provenance: dict | None = None) -> None:
+def save_adapter(
+    folder: Path, tree: Tree, config: RoGeConfig, provenance: dict | None = None
+) -> None:
     """Write what training on top of a model changed: LoRA factors and the leaves that trained fully, in float32.
 
     `tree` is the sparse tree that trained. The folder gets `adapter.safetensors`, `config.json` and a model card,
@@ -162,10 +180,17 @@ def save_adapter(folder: Path, tree: Tree, config: RoGeConfig, provenance: dict 
     temporary = folder.with_name(folder.name + ".part")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    leaves = {path: jnp.asarray(x, jnp.float32) for path, x in flatten(jax.device_get(tree)).items()}
+    leaves = {
+        path: jnp.asarray(x, jnp.float32) for path, x in flatten(jax.device_get(tree)).items()
+    }
     check_adapter(unflatten(leaves), config, source="the adapter")
     save_file(leaves, temporary / ADAPTER)
-    record = {"format": 1, "kind": "adapter", "config": to_dict(config), "provenance": provenance or {}}
+    record = {
+        "format": 1,
+        "kind": "adapter",
+        "config": to_dict(config),
+        "provenance": provenance or {},
+    }
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
     (temporary / "README.md").write_text(adapter_card(leaves, config, provenance or {}))
     old = folder.with_name(folder.name + ".old")
@@ -188,7 +213,9 @@ def load_adapter(folder: str | Path) -> tuple[Tree, RoGeConfig]:
     try:
         tree = unflatten(load_file(folder / ADAPTER))
     except SafetensorError as error:
-        raise UserError(f"{folder / ADAPTER} is truncated or damaged ({error}): copy it again.") from error
+        raise UserError(
+            f"{folder / ADAPTER} is truncated or damaged ({error}): copy it again."
+        ) from error
     check_adapter(tree, config, source=str(folder / ADAPTER))
     return tree, config
 
@@ -233,7 +260,9 @@ def load_config(folder: Path) -> RoGeConfig:
         record = json.loads(file.read_text())
         values = record["config"]
     except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UserError(f"{file} is not a roge_jax model config ({error}): copy the folder again.") from error
+        raise UserError(
+            f"{file} is not a roge_jax model config ({error}): copy the folder again."
+        ) from error
     return from_dict(values, source=str(file))
 
 

@@ -27,7 +27,9 @@ class EncoderConfig:
     dino_depth: int = 24  # 0: a linear patch embedding of RGB and rays instead of DINOv2
     position_grid: int = 37  # side of DINOv2's learned position table
     registers: int = 4
-    long_side: int | None = 518  # images are resized to this inside the encoder; None: used as they are
+    long_side: int | None = (
+        518  # images are resized to this inside the encoder; None: used as they are
+    )
     relative_cameras: bool = False  # projective relative-camera attention in global blocks
 
 
@@ -95,7 +97,9 @@ class LoraConfig:
     dit_rank: int = 32
     dit_match: str = r"blocks/.*(self_attn|cross_attn)/(q|k|v|o)$|blocks/.*ffn/(fc1|fc2)$"
     recon_rank: int = 8
-    recon_match: str = r"^(?!encoder/patch_encoder/patch_embed$)"  # every linear and the ray convolution
+    recon_match: str = (
+        r"^(?!encoder/patch_encoder/patch_embed$)"  # every linear and the ray convolution
+    )
 
 
 @dataclass(frozen=True)
@@ -181,7 +185,13 @@ def _mini() -> RoGeConfig:
         frames=17,
         max_context=6,
         encoder=EncoderConfig(
-            patch=8, width=192, heads=4, depth=3, dino_depth=0, long_side=None, relative_cameras=True
+            patch=8,
+            width=192,
+            heads=4,
+            depth=3,
+            dino_depth=0,
+            long_side=None,
+            relative_cameras=True,
         ),
         renderer=RendererConfig(
             width=192, heads=4, depth=6, attention="cross", relative_cameras=True, chunk=32
@@ -222,7 +232,9 @@ def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
     known = {f.name: f for f in dataclasses.fields(cls)}
     unknown = sorted(set(values) - set(known))
     if unknown:
-        raise UserError(f"{source}: unknown field '{unknown[0]}': {did_you_mean(unknown[0], known)}")
+        raise UserError(
+            f"{source}: unknown field '{unknown[0]}': {did_you_mean(unknown[0], known)}"
+        )
     built = {}
     for name, value in values.items():
         default = known[name].default_factory

@@ -22,19 +22,35 @@ CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mas
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="python -m roge_jax.convert", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        prog="python -m roge_jax.convert",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
     )
-    p.add_argument("--wan", type=Path, help="Wan2.1 transformer: official or diffusers folder, or its file")
-    p.add_argument("--wan-vae", type=Path, help="Wan2.1_VAE.pth or diffusers' vae (default: beside --wan)")
-    p.add_argument("--lagernvs", type=Path, help="LagerNVS checkpoint, model.pt: encoder and renderer")
-    p.add_argument("--vggt", type=Path, help="VGGT-1B, where LagerNVS is not at hand: the aggregator alone")
+    p.add_argument(
+        "--wan", type=Path, help="Wan2.1 transformer: official or diffusers folder, or its file"
+    )
+    p.add_argument(
+        "--wan-vae", type=Path, help="Wan2.1_VAE.pth or diffusers' vae (default: beside --wan)"
+    )
+    p.add_argument(
+        "--lagernvs", type=Path, help="LagerNVS checkpoint, model.pt: encoder and renderer"
+    )
+    p.add_argument(
+        "--vggt", type=Path, help="VGGT-1B, where LagerNVS is not at hand: the aggregator alone"
+    )
     p.add_argument("--framecrafter", type=Path, help="FrameCrafter checkpoint, merged into --wan")
     p.add_argument(
         "--preset",
         help="paper, wan1.3b, ..., or a model folder whose config is taken\n(default: the sizes found in the files)",
     )
-    p.add_argument("--prompt-embedding", type=Path, help="umT5 rows [rows, 4096] as .npy or .safetensors")
-    p.add_argument("--t5", type=Path, help="umT5 encoder and tokenizer (Hugging Face folder) to compute them with")
+    p.add_argument(
+        "--prompt-embedding", type=Path, help="umT5 rows [rows, 4096] as .npy or .safetensors"
+    )
+    p.add_argument(
+        "--t5",
+        type=Path,
+        help="umT5 encoder and tokenizer (Hugging Face folder) to compute them with",
+    )
     p.add_argument("--prompt", default="", help="the prompt for --t5 (default: the empty prompt)")
     p.add_argument(
         "--random",
@@ -44,7 +60,9 @@ def parser() -> argparse.ArgumentParser:
         type=one_of(NETWORKS),
         help="networks to initialise randomly instead: encoder renderer vae dit",
     )
-    p.add_argument("--seed", type=int, default=0, help="of everything that is initialised (default: 0)")
+    p.add_argument(
+        "--seed", type=int, default=0, help="of everything that is initialised (default: 0)"
+    )
     p.add_argument("--out", type=Path, help="new model folder")
     p.add_argument(
         "--dtype",
@@ -52,8 +70,12 @@ def parser() -> argparse.ArgumentParser:
         type=one_of(("bfloat16", "float32")),
         help="of the large frozen matrices (default: bfloat16); all else is float32",
     )
-    p.add_argument("--shard-gb", type=float, default=4.0, help="largest size of one file in GB (default: 4)")
-    p.add_argument("--dry-run", action="store_true", help="print what would be done, from headers alone")
+    p.add_argument(
+        "--shard-gb", type=float, default=4.0, help="largest size of one file in GB (default: 4)"
+    )
+    p.add_argument(
+        "--dry-run", action="store_true", help="print what would be done, from headers alone"
+    )
     p.add_argument("--resume", action="store_true", help="continue a conversion that was cut off")
     p.add_argument("--debug", action="store_true", help="show tracebacks")
     return p
@@ -78,17 +100,26 @@ def main(args: argparse.Namespace) -> None:
         return
     from tqdm import tqdm
 
-    with tqdm(total=sum(layout.sizes), unit="B", unit_scale=True, disable=not sys.stderr.isatty()) as bar:
+    with tqdm(
+        total=sum(layout.sizes), unit="B", unit_scale=True, disable=not sys.stderr.isatty()
+    ) as bar:
 
         def progress(done: int, _total: int) -> None:
             bar.update(done - bar.n)
 
         try:
             importer.write(
-                plan, args.out, resume=args.resume, shard_bytes=1e9 * args.shard_gb, progress=progress
+                plan,
+                args.out,
+                resume=args.resume,
+                shard_bytes=1e9 * args.shard_gb,
+                progress=progress,
             )
         except KeyboardInterrupt:
-            print(f"{args.out}.part is kept: the same command with --resume continues it.", file=sys.stderr)
+            print(
+                f"{args.out}.part is kept: the same command with --resume continues it.",
+                file=sys.stderr,
+            )
             raise
     print(f"{args.out}: written")
 
@@ -106,7 +137,9 @@ def make_plan(args: argparse.Namespace):
     wan = vae_path = recon = framecrafter = None
     role = "--lagernvs" if args.lagernvs else "--vggt"
     if args.framecrafter and not args.wan:
-        raise UserError("--framecrafter holds changes to a Wan2.1 transformer: give that one with --wan.")
+        raise UserError(
+            "--framecrafter holds changes to a Wan2.1 transformer: give that one with --wan."
+        )
     if args.wan:
         wan, vae_path = published.find_wan(args.wan)
     if args.lagernvs or args.vggt:
@@ -140,7 +173,9 @@ def make_plan(args: argparse.Namespace):
     elif config.dit.text_len and args.t5 and not args.dry_run:
         given["prompt/rows"] = encode_prompt(args.t5, args.prompt, config.dit)
     elif args.prompt_embedding or (args.t5 and not config.dit.text_len):
-        raise UserError(f"Preset '{config.name}' reads no text: leave --prompt-embedding and --t5 away.")
+        raise UserError(
+            f"Preset '{config.name}' reads no text: leave --prompt-embedding and --t5 away."
+        )
     fills = [fill for part in filled for fill in part.fills]
     tree = flatten(specs(config))
     importer.check_coverage(fills, tree)
@@ -191,7 +226,9 @@ def choose_config(name: str | None, wan, recon):
     if found is not None:
         dit = dataclasses.replace(found, in_channels=CONDITIONED)
         same = [p for p in config.PRESETS if config.preset(p).dit == dit]
-        chosen = config.preset(same[0]) if same else dataclasses.replace(chosen, name="custom", dit=dit)
+        chosen = (
+            config.preset(same[0]) if same else dataclasses.replace(chosen, name="custom", dit=dit)
+        )
     if recon is not None:
         encoder, renderer = published.recon_config(recon)
         renderer = renderer or chosen.renderer
@@ -208,12 +245,19 @@ def _require(args, config, wan, vae, recon) -> None:
     """Every network has a file or is declared random."""
     from .errors import UserError
 
-    options = {"dit": "--wan", "vae": "--wan-vae", "encoder": "--lagernvs", "renderer": "--lagernvs"}
+    options = {
+        "dit": "--wan",
+        "vae": "--wan-vae",
+        "encoder": "--lagernvs",
+        "renderer": "--lagernvs",
+    }
     have = {"dit": wan, "vae": vae, "encoder": recon, "renderer": recon}
     lost = [name for name in NETWORKS if have[name] is None and name not in args.random]
     both = [name for name in args.random if have[name] is not None]
     if both:
-        raise UserError(f"--random {both[0]}, but a file fills it as well: leave one of the two away.")
+        raise UserError(
+            f"--random {both[0]}, but a file fills it as well: leave one of the two away."
+        )
     if lost:
         wanted = " and ".join(dict.fromkeys(options[name] for name in lost))
         raise UserError(
@@ -240,7 +284,9 @@ def summary(plan, filled, layout) -> str:
             f"{part.source.nbytes / 1e9:.2f} GB{shards}"
         )
         lines += [f"    {note}" for note in part.notes]
-    lines.append(f"{'network':10}{'leaves':>8}{'tensors':>9}{'parameters':>16}{'GB':>8}{'initialised':>13}")
+    lines.append(
+        f"{'network':10}{'leaves':>8}{'tensors':>9}{'parameters':>16}{'GB':>8}{'initialised':>13}"
+    )
     initial = set(plan.initialised)
     for network in dict.fromkeys(path.partition("/")[0] for path in plan.specs):
         specs = {path: s for path, s in plan.specs.items() if path.startswith(f"{network}/")}
@@ -255,10 +301,14 @@ def summary(plan, filled, layout) -> str:
     )
     if initial:
         shown = [p for p in plan.initialised if not p.startswith(("vae/", "dit/", "renderer/"))]
-        whole = [n for n in ("vae", "dit", "renderer") if any(p.startswith(f"{n}/") for p in initial)]
+        whole = [
+            n for n in ("vae", "dit", "renderer") if any(p.startswith(f"{n}/") for p in initial)
+        ]
         lines.append(f"not in the files, initialised: {', '.join(whole + shown)}")
     if "prompt/rows" in initial:
-        lines.append("no prompt embedding: its rows are zero; the published transformers expect --t5 or --prompt-embedding")
+        lines.append(
+            "no prompt embedding: its rows are zero; the published transformers expect --t5 or --prompt-embedding"
+        )
     return "\n".join(lines)
 
 

@@ -19,7 +19,9 @@ HELD_OUT = "procedural:1000000000..1000000049"
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="python -m roge_jax.evaluate", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        prog="python -m roge_jax.evaluate",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
     )
     p.add_argument("--checkpoint", default="mini", help="model folder or name (default: mini)")
     p.add_argument(
@@ -32,8 +34,15 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--steps", type=int, default=20, help="sampling steps (default: 20)")
     p.add_argument("--solver", default="euler", help="sampler (default: euler)")
     p.add_argument("--seed", type=int, default=0, help="seed of the noise")
-    p.add_argument("--sweep", type=float, nargs=2, help="degrees that procedural paths turn, LOW HIGH")
-    p.add_argument("--out", type=Path, default=Path("results.json"), help="results file (default: results.json)")
+    p.add_argument(
+        "--sweep", type=float, nargs=2, help="degrees that procedural paths turn, LOW HIGH"
+    )
+    p.add_argument(
+        "--out",
+        type=Path,
+        default=Path("results.json"),
+        help="results file (default: results.json)",
+    )
     p.add_argument("--sheet", type=Path, help="also write a contact sheet of the scenes (PNG)")
     p.add_argument("--debug", action="store_true", help="show tracebacks")
     return p
@@ -138,7 +147,10 @@ class Evaluator:
 
         m, n, frames = len(scene["context"]), len(scene["target"]), self.config.frames
         path = pad_path(Cameras(scene["K"][m:], scene["c2w"][m:]), frames)
-        K, c2w = np.concatenate([scene["K"][:m], path.K]), np.concatenate([scene["c2w"][:m], path.c2w])
+        K, c2w = (
+            np.concatenate([scene["K"][:m], path.K]),
+            np.concatenate([scene["c2w"][:m], path.c2w]),
+        )
         rgb = np.concatenate([scene["rgb"], np.repeat(scene["rgb"][-1:], frames - n, 0)])
         views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
         truth = views.pop("target_rgb")
@@ -173,7 +185,13 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         truth = scene["rgb"][m:]
         videos = evaluator.videos(scene)
         simple, _ = baselines(
-            scene["rgb"][:m], scene["K"][:m], scene["c2w"][:m], scene["K"][m:], scene["c2w"][m:], size, scene["depth"]
+            scene["rgb"][:m],
+            scene["K"][:m],
+            scene["c2w"][:m],
+            scene["K"][m:],
+            scene["c2w"][m:],
+            size,
+            scene["depth"],
         )
         row = {
             "scene": Path(name).name or name,
@@ -209,7 +227,9 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
 
         args.sheet.parent.mkdir(parents=True, exist_ok=True)
         labels = [*(f"photo {i}" for i in range(args.context)), "truth", *methods]
-        sheet = report.contact_sheet(rows[:12], labels, row_labels=[r["scene"] for r in results[:12]])
+        sheet = report.contact_sheet(
+            rows[:12], labels, row_labels=[r["scene"] for r in results[:12]]
+        )
         Image.fromarray(sheet).save(args.sheet, optimize=True)
         print(f"wrote {args.sheet}")
     return document

@@ -27,13 +27,21 @@ FILES = {
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="python -m roge_jax.export", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        prog="python -m roge_jax.export",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
     )
     p.add_argument("adapter", type=Path, help="adapter folder written by training")
     p.add_argument("--merge", metavar="BASE", help="model folder or name to merge it into")
-    p.add_argument("--style", type=one_of(STYLES), help="names for other programs (the transformer's LoRA alone)")
+    p.add_argument(
+        "--style",
+        type=one_of(STYLES),
+        help="names for other programs (the transformer's LoRA alone)",
+    )
     p.add_argument("--out", type=Path, required=True, help="new folder")
-    p.add_argument("--shard-gb", type=float, default=4.0, help="with --merge: largest size of one file in GB")
+    p.add_argument(
+        "--shard-gb", type=float, default=4.0, help="with --merge: largest size of one file in GB"
+    )
     p.add_argument("--debug", action="store_true", help="show tracebacks")
     return p
 
@@ -44,11 +52,15 @@ def main(args: argparse.Namespace) -> None:
     from .weights.importer import check_output
 
     if bool(args.merge) == bool(args.style):
-        raise UserError("Give either --merge BASE for a whole model, or --style for other programs' LoRA files.")
+        raise UserError(
+            "Give either --merge BASE for a whole model, or --style for other programs' LoRA files."
+        )
     check_output(args.out)
     tree, config = load_adapter(args.adapter)
     if args.merge:
-        merge_into(args.merge, tree, config, args.adapter, args.out, shard_bytes=1e9 * args.shard_gb)
+        merge_into(
+            args.merge, tree, config, args.adapter, args.out, shard_bytes=1e9 * args.shard_gb
+        )
     else:
         write_lora(tree, config, args.style, args.out)
     print(f"{args.out}: written")
@@ -70,7 +82,9 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
 
     folder = checkpoint.find_model(base)
     if (folder / checkpoint.ADAPTER).exists():
-        raise UserError(f"--merge {base} is an adapter itself: give the model that it was trained on.")
+        raise UserError(
+            f"--merge {base} is an adapter itself: give the model that it was trained on."
+        )
     base_config = checkpoint.load_config(folder)
     for part in ("encoder", "renderer", "vae", "dit", "fusion"):
         if not _same_shapes(part, base_config, config):
@@ -81,7 +95,9 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
     source, specs = open_source(folder), flatten(model.specs(config))
     lost = [path for path in specs if path not in source.tensors]
     if lost:
-        raise UserError(f"{folder} is incomplete: {lost[0]} and {len(lost) - 1} more leaves are missing.")
+        raise UserError(
+            f"{folder} is incomplete: {lost[0]} and {len(lost) - 1} more leaves are missing."
+        )
     changed = flatten(tree)
     fills = []
     for path, spec in specs.items():
@@ -92,7 +108,9 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
         if path.endswith("/kernel") and f"{layer}/lora_a" in changed:
             factors = tuple(np.asarray(changed[f"{layer}/lora_{side}"]) for side in "ab")
         for i in range(spec.shape[0]) if spec.axes[0] == "layers" else (None,):
-            fills.append(importer.Fill(path, i, source, path, functools.partial(_merged, factors, i)))
+            fills.append(
+                importer.Fill(path, i, source, path, functools.partial(_merged, factors, i))
+            )
     given = {p: np.asarray(x) for p, x in changed.items() if not p.endswith(("lora_a", "lora_b"))}
     record = json.loads((folder / "config.json").read_text()).get("provenance", {})
     trained = json.loads((adapter / "config.json").read_text()).get("provenance", {})
@@ -120,7 +138,8 @@ def _same_shapes(part: str, a, b) -> bool:
     from .core.params import abstract, flatten
 
     shapes = [
-        {p: s.shape for p, s in flatten(abstract(model.specs(config)[part])).items()} for config in (a, b)
+        {p: s.shape for p, s in flatten(abstract(model.specs(config)[part])).items()}
+        for config in (a, b)
     ]
     return shapes[0] == shapes[1]
 
@@ -135,7 +154,11 @@ def write_lora(tree, config, style: str, out: Path) -> None:
     from .weights.importer import check_output
     from .weights.lora_export import export_lora
 
-    flat = {p: np.asarray(x) for p, x in flatten(tree.get("dit", {})).items() if p.endswith(("lora_a", "lora_b"))}
+    flat = {
+        p: np.asarray(x)
+        for p, x in flatten(tree.get("dit", {})).items()
+        if p.endswith(("lora_a", "lora_b"))
+    }
     if not flat:
         raise UserError("The adapter holds no LoRA of the transformer: only --merge can export it.")
     tensors = export_lora(unflatten(flat), style=style)  # type: ignore[arg-type]
@@ -144,8 +167,16 @@ def write_lora(tree, config, style: str, out: Path) -> None:
     save_file(tensors, part / FILES[style], metadata={"format": "pt"})
     rank = next(x.shape[-1] for p, x in flat.items() if p.endswith("lora_a"))
     if style == "peft":
-        names = sorted({k.partition(".lora_")[0].removeprefix("base_model.model.") for k in tensors})
-        adapter = {"peft_type": "LORA", "r": rank, "lora_alpha": rank, "target_modules": names, "bias": "none"}
+        names = sorted(
+            {k.partition(".lora_")[0].removeprefix("base_model.model.") for k in tensors}
+        )
+        adapter = {
+            "peft_type": "LORA",
+            "r": rank,
+            "lora_alpha": rank,
+            "target_modules": names,
+            "bias": "none",
+        }
         (part / "adapter_config.json").write_text(json.dumps(adapter, indent=1) + "\n")
     part.rename(out)
     left = sorted({p.partition("/")[0] for p in flatten(tree)} - {"dit"})

@@ -57,8 +57,12 @@ def ray_condition(plucker: jax.Array, contexts: int) -> jax.Array:
 def geometry_condition(p: Tree, features: jax.Array, latent_size: tuple[int, int], contexts: int):
     """G: ray features [m + n, gh, gw, d] -> [slots, lh, lw, 4C], projected, resampled, four frames to a slot."""
     x = linear(p["geometry_adapter"], features)
-    if x.shape[1:3] != latent_size:  # bilinear, half-pixel centres, no antialiasing (as torch's interpolate)
-        x = jax.image.resize(x, (x.shape[0], *latent_size, x.shape[-1]), "bilinear", antialias=False)
+    if (
+        x.shape[1:3] != latent_size
+    ):  # bilinear, half-pixel centres, no antialiasing (as torch's interpolate)
+        x = jax.image.resize(
+            x, (x.shape[0], *latent_size, x.shape[-1]), "bilinear", antialias=False
+        )
     return pack_views(x, contexts)
 
 
@@ -70,7 +74,9 @@ def condition(
     lh, lw = rays.shape[1:3]
     geometry = geometry_condition(p, features, (lh, lw), contexts)
     tokens = patch_conv(p["rays_embed"], rays) + patch_conv(p["geometry_embed"], geometry)
-    return Condition(appearance(context_latents, rays.shape[0]), tokens.reshape(-1, tokens.shape[-1]))
+    return Condition(
+        appearance(context_latents, rays.shape[0]), tokens.reshape(-1, tokens.shape[-1])
+    )
 
 
 def time_index(contexts: int, slots: int) -> np.ndarray:

@@ -47,7 +47,9 @@ def specs(config: RoGeConfig) -> Tree:
         "dit": dit.dit_specs(config.dit),
         "fusion": fusion.fusion_specs(config),
     }
-    if config.dit.text_len:  # the prompt's text embedding, zero-padded: text encoders are not needed afterwards
+    if (
+        config.dit.text_len
+    ):  # the prompt's text embedding, zero-padded: text encoders are not needed afterwards
         shape = (config.dit.text_len, config.dit.text_dim)
         tree["prompt"] = {"rows": Spec(shape, (None, None), zeros)}
     return tree
@@ -83,7 +85,9 @@ def split(params: Tree, pattern: str) -> tuple[Tree, Tree]:
 
 def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Array]:
     """K of all views in pixels of the reconstruction images (a plain resize of the generation crop), and c2w."""
-    scale = jnp.asarray([config.recon_width / config.width, config.recon_height / config.height, 1.0])
+    scale = jnp.asarray(
+        [config.recon_width / config.width, config.recon_height / config.height, 1.0]
+    )
     return views["K"] * scale[None, :, None], views["c2w"]
 
 
@@ -128,9 +132,7 @@ def query_rays(
     if cfg.relative_cameras:
         head_dim = cfg.width // cfg.heads
         grid = (size[0] // cfg.patch, size[1] // cfg.patch)
-        rays = relative_cameras(
-            K, c2w, size, grid=grid, specials=cfg.registers, head_dim=head_dim
-        )
+        rays = relative_cameras(K, c2w, size, grid=grid, specials=cfg.registers, head_dim=head_dim)
         seen_K, seen_c2w = recon_cameras(context or views, config)
         cameras = relative_cameras(
             seen_K[:m],
@@ -175,7 +177,12 @@ def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax
 
 
 def condition(
-    params: Tree, context_latents: jax.Array, features: jax.Array, views: Views, *, config: RoGeConfig
+    params: Tree,
+    context_latents: jax.Array,
+    features: jax.Array,
+    views: Views,
+    *,
+    config: RoGeConfig,
 ) -> Condition:
     """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views."""
     m = context_latents.shape[0]
@@ -235,11 +242,15 @@ def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
 # Training (Sec. 3.3).
 
 
-def photometric(params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
+def photometric(
+    params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig
+) -> jax.Array:
     """Mean squared error of the RGB head over all M + N views."""
     size = (config.recon_height, config.recon_width)
     truth = [
-        resized(views[f"{kind}_rgb"], *size) if views.get(f"{kind}_recon") is None else views[f"{kind}_recon"]
+        resized(views[f"{kind}_rgb"], *size)
+        if views.get(f"{kind}_recon") is None
+        else views[f"{kind}_recon"]
         for kind in ("context", "target")
     ]
     rgb = decode_rgb(params, features, config=config)
@@ -264,7 +275,9 @@ def flow_matching(
     x = flow.x_sigma(x0, noise, sigma)
     v = velocity(params, x, sigma, cond, config=config, contexts=contexts, remat=remat)
     error = (v - flow.velocity_target(x0, noise))[contexts:]
-    return flow.loss_weight(sigma, weighting=cfg.weighting, shift=cfg.shift) * jnp.square(error).mean()
+    return (
+        flow.loss_weight(sigma, weighting=cfg.weighting, shift=cfg.shift) * jnp.square(error).mean()
+    )
 
 
 def scene_loss(
@@ -367,7 +380,12 @@ def draw_noise(key: jax.Array, contexts: int, *, config: RoGeConfig) -> jax.Arra
 
 
 def sampling_field(
-    params: Tree, prepared: Prepared, noise: jax.Array, *, config: RoGeConfig, mode: ContextSlots = "noised"
+    params: Tree,
+    prepared: Prepared,
+    noise: jax.Array,
+    *,
+    config: RoGeConfig,
+    mode: ContextSlots = "noised",
 ) -> tuple[Callable, Callable | None]:
     """(velocity(x, sigma), project(x, sigma) or None) for the functions of `video.solvers`."""
     m = prepared.context_latents.shape[0]

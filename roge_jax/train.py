@@ -21,7 +21,9 @@ RECIPES = ("lora", "hires", "all")
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
-        prog="python -m roge_jax.train", description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+        prog="python -m roge_jax.train",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
     )
     p.add_argument("preset", help="tiny, mini, wan1.3b or paper")
     p.add_argument(
@@ -32,11 +34,25 @@ def parser() -> argparse.ArgumentParser:
         "vae_images, vae_clips, recon_low, recon, prior, generator, joint: one stage of the recipe\n"
         "that makes a small model from nothing; all: all of them in order",
     )
-    p.add_argument("--init", help="model folder or name to start from, or 'scratch' (default: the preset's own)")
-    p.add_argument("--data", type=Path, help="pool written by roge_jax.data.procedural (default: render as we go)")
-    p.add_argument("--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)")
+    p.add_argument(
+        "--init",
+        help="model folder or name to start from, or 'scratch' (default: the preset's own)",
+    )
+    p.add_argument(
+        "--data",
+        type=Path,
+        help="pool written by roge_jax.data.procedural (default: render as we go)",
+    )
+    p.add_argument(
+        "--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)"
+    )
     p.add_argument("--steps", type=int, help="optimiser steps (default: the stage's own)")
-    p.add_argument("--scale", type=float, default=1.0, help="multiplies the steps of every stage of --stage all")
+    p.add_argument(
+        "--scale",
+        type=float,
+        default=1.0,
+        help="multiplies the steps of every stage of --stage all",
+    )
     p.add_argument("--batch", type=int, help="scenes per step (default: the stage's own)")
     p.add_argument("--lr", type=float, help="learning rate (default: the stage's own)")
     p.add_argument("--size", help="HEIGHTxWIDTH of stage hires (default: 1.5 times the model's)")
@@ -53,11 +69,17 @@ def parser() -> argparse.ArgumentParser:
         choices=("float32", "bfloat16"),
         help="of weights that do not train (default: bfloat16 on accelerators, float32 on a CPU)",
     )
-    p.add_argument("--show-mesh", action="store_true", help="print where every leaf lies, then train")
+    p.add_argument(
+        "--show-mesh", action="store_true", help="print where every leaf lies, then train"
+    )
     p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
     p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
-    p.add_argument("--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes")
-    p.add_argument("--tensorboard", action="store_true", help="also write TensorBoard events (extra 'log')")
+    p.add_argument(
+        "--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes"
+    )
+    p.add_argument(
+        "--tensorboard", action="store_true", help="also write TensorBoard events (extra 'log')"
+    )
     p.add_argument("--debug", action="store_true", help="show tracebacks")
     return p
 
@@ -159,7 +181,10 @@ def reduced(frozen, dtype: str):
 
     with on_host():
         return unflatten(
-            {path: x if keeps_float32(path) else x.astype(dtype) for path, x in flatten(frozen).items()}
+            {
+                path: x if keeps_float32(path) else x.astype(dtype)
+                for path, x in flatten(frozen).items()
+            }
         )
 
 
@@ -195,7 +220,9 @@ def run_stage(args, stage, params, cfg, mesh=None):
     changes = {"steps": args.steps, "batch": args.batch}
     stage = dataclasses.replace(stage, **{k: v for k, v in changes.items() if v})
     if args.lr:
-        stage = dataclasses.replace(stage, optim=dataclasses.replace(stage.optim, learning_rate=args.lr))
+        stage = dataclasses.replace(
+            stage, optim=dataclasses.replace(stage.optim, learning_rate=args.lr)
+        )
     if mesh is not None:
         check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
@@ -219,7 +246,9 @@ def run_stage(args, stage, params, cfg, mesh=None):
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     say = print if distributed.is_main() else (lambda *_: None)
     if args.show_mesh and mesh is not None:
-        say(f"trains: {sharding.describe(specs, mesh)}\nfrozen: {sharding.describe(frozen_specs, mesh)}")
+        say(
+            f"trains: {sharding.describe(specs, mesh)}\nfrozen: {sharding.describe(frozen_specs, mesh)}"
+        )
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
     say(
         f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
@@ -262,9 +291,15 @@ def run_stage(args, stage, params, cfg, mesh=None):
         params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stage.objective == "vae":
         cfg = stages.measure_latents(params, source, cfg, args.seed)
-    provenance = {"stage": stage.name, "steps": int(state["step"]), "skipped": int(state["skipped"])}
+    provenance = {
+        "stage": stage.name,
+        "steps": int(state["step"]),
+        "skipped": int(state["skipped"]),
+    }
     if distributed.is_main():
-        checkpoint.save_model(out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance)
+        checkpoint.save_model(
+            out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
+        )
     say(f"{stage.name}: saved {out / 'model'}")
     return params, cfg
 

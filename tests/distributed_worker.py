@@ -25,7 +25,15 @@ def batches(rows):
     return draw
 
 
-def train(out: Path, data: int, fsdp: int, steps: int, *, resume: bool = False, die_after: int | None = None):
+def train(
+    out: Path,
+    data: int,
+    fsdp: int,
+    steps: int,
+    *,
+    resume: bool = False,
+    die_after: int | None = None,
+):
     import jax
     import jax.numpy as jnp
 

@@ -56,7 +56,9 @@ def recon_tensors(config: RoGeConfig = CONFIG, seed=3):
     """LagerNVS: ({"encoder/..", "renderer/.."}, tensors with one in bfloat16)."""
     specs = {k: model.specs(config)[k] for k in ("encoder", "renderer")}
     tree = random_tree(specs, seed)
-    key = "renderer/registers"  # bfloat16 in the released file, so that it holds exactly these values
+    key = (
+        "renderer/registers"  # bfloat16 in the released file, so that it holds exactly these values
+    )
     tree[key] = tree[key].astype(ml_dtypes.bfloat16).astype(np.float32)
     return tree, lagernvs.published(unflatten(tree), config.encoder, config.renderer)
 
@@ -114,7 +116,11 @@ def save_listing(file: Path, name: str, column="official key", prefix="") -> Pat
     rows = key_listing(name)
     kinds = {"float32": "F32", "bfloat16": "BF16"}
     column_of_dtype = next((c for c in rows[0] if c.startswith("dtype")), None)
-    dtypes = {prefix + row[column]: kinds[row[column_of_dtype]] for row in rows} if column_of_dtype else {}
+    dtypes = (
+        {prefix + row[column]: kinds[row[column_of_dtype]] for row in rows}
+        if column_of_dtype
+        else {}
+    )
     return save_headers(file, {prefix + row[column]: row["shape"] for row in rows}, dtypes=dtypes)
 
 
@@ -124,7 +130,10 @@ def save_torch(file: Path, shapes, value, wrapper: str | None = None, dtypes=Non
     `value(key, shape)` gives an array; `wrapper` puts the tensors into {wrapper: tensors}. Opcodes are those that
     PyTorch writes, so that its weights-only loader reads the file too.
     """
-    storages = {"F32": ("FloatStorage", np.float32), "BF16": ("BFloat16Storage", ml_dtypes.bfloat16)}
+    storages = {
+        "F32": ("FloatStorage", np.float32),
+        "BF16": ("BFloat16Storage", ml_dtypes.bfloat16),
+    }
 
     def text(s: str) -> bytes:
         return b"X" + len(s.encode()).to_bytes(4, "little") + s.encode()
@@ -141,14 +150,20 @@ def save_torch(file: Path, shapes, value, wrapper: str | None = None, dtypes=Non
         count = int(np.prod(shape))
         strides = [int(np.prod(shape[j + 1 :])) for j in range(len(shape))]
         storage = b"(" + text("storage") + f"ctorch\n{kind}\n".encode() + text(str(i)) + text("cpu")
-        content += text(key) + b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + number(count) + b"tQ"
-        content += number(0) + sizes(shape) + sizes(strides) + b"\x89ccollections\nOrderedDict\n)RtR"
+        content += (
+            text(key) + b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + number(count) + b"tQ"
+        )
+        content += (
+            number(0) + sizes(shape) + sizes(strides) + b"\x89ccollections\nOrderedDict\n)RtR"
+        )
     content += b"u" + (b"s" if wrapper else b"") + b"."
     with zipfile.ZipFile(file, "w", allowZip64=True) as archive:
         archive.writestr("archive/data.pkl", content)
         archive.writestr("archive/byteorder", "little")
         for i, (key, shape) in enumerate(shapes.items()):
             dtype = storages[(dtypes or {}).get(key, "F32")][1]
-            archive.writestr(f"archive/data/{i}", np.ascontiguousarray(value(key, shape), dtype).tobytes())
+            archive.writestr(
+                f"archive/data/{i}", np.ascontiguousarray(value(key, shape), dtype).tobytes()
+            )
         archive.writestr("archive/version", "3\n")
     return file

@@ -41,7 +41,12 @@ def files(tmp_path_factory):
     (root / "config").mkdir()
     record = {"format": 1, "config": to_dict(CONFIG), "provenance": {}}
     (root / "config" / "config.json").write_text(json.dumps(record))
-    return {"root": root, "wan": wan, "lagernvs": root / "lagernvs.safetensors", "config": root / "config"}
+    return {
+        "root": root,
+        "wan": wan,
+        "lagernvs": root / "lagernvs.safetensors",
+        "config": root / "config",
+    }
 
 
 def run(*arguments):
@@ -83,10 +88,14 @@ def test_official_files_fill_every_leaf_exactly(files, tmp_path, capsys):
     np.testing.assert_array_equal(got["prompt/rows"][:2], 1)
     assert not got["prompt/rows"][2:].any() and got["fusion/geometry_adapter/kernel"].std() > 0
     assert len(list((tmp_path / "m").glob("model-*"))) > 3
-    assert sorted(p.name for p in (tmp_path / "m").iterdir() if "model-" not in p.name) == ["config.json"]
+    assert sorted(p.name for p in (tmp_path / "m").iterdir() if "model-" not in p.name) == [
+        "config.json"
+    ]
     tree, config = checkpoint.load_model(tmp_path / "m")
     assert config == CONFIG
-    np.testing.assert_array_equal(tree["dit"]["head"]["linear"]["kernel"], want["dit/head/linear/kernel"])
+    np.testing.assert_array_equal(
+        tree["dit"]["head"]["linear"]["kernel"], want["dit/head/linear/kernel"]
+    )
     record = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
     assert record["initialised"] == sorted(p for p in got if p.startswith("fusion/"))
     assert [part["option"] for part in record["converted"]] == ["--wan", "--wan-vae", "--lagernvs"]
@@ -97,7 +106,9 @@ def test_bfloat16_is_for_large_frozen_matrices_alone(files, tmp_path):
     run(*everything(files), "--out", tmp_path / "m")
     want = expected()
     for path, value in stored(tmp_path / "m").items():
-        half = path.endswith("/kernel") and path.startswith(("encoder/", "renderer/", "dit/blocks/", "dit/text_embed", "dit/clip_embed"))
+        half = path.endswith("/kernel") and path.startswith(
+            ("encoder/", "renderer/", "dit/blocks/", "dit/text_embed", "dit/clip_embed")
+        )
         assert value.dtype == (BF16 if half else np.float32), path
         if path in want:
             np.testing.assert_array_equal(value, want[path].astype(value.dtype), err_msg=path)
@@ -110,14 +121,21 @@ def test_bfloat16_is_for_large_frozen_matrices_alone(files, tmp_path):
 def test_diffusers_layout_and_bfloat16_source(files, tmp_path, prefix):
     tree, tensors = made.dit_tensors(names="diffusers")
     tensors = {prefix + k: v.astype(BF16) for k, v in tensors.items()}
-    tensors[f"{prefix}blocks.0.attn2.norm_added_q.weight"] = np.ones(128, np.float32)  # read by nobody
+    tensors[f"{prefix}blocks.0.attn2.norm_added_q.weight"] = np.ones(
+        128, np.float32
+    )  # read by nobody
     made.save_sharded(tmp_path / "repo" / "transformer", tensors)
-    made.save(tmp_path / "repo" / "vae" / "diffusion_pytorch_model.safetensors", made.vae_tensors(names="diffusers")[1])
+    made.save(
+        tmp_path / "repo" / "vae" / "diffusion_pytorch_model.safetensors",
+        made.vae_tensors(names="diffusers")[1],
+    )
     run("--wan", tmp_path / "repo", "--preset", files["config"], "--lagernvs", files["lagernvs"],
         "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
     got = stored(tmp_path / "m")
     for path, value in tree.items():
-        np.testing.assert_array_equal(got[f"dit/{path}"], value.astype(BF16).astype(np.float32), err_msg=path)
+        np.testing.assert_array_equal(
+            got[f"dit/{path}"], value.astype(BF16).astype(np.float32), err_msg=path
+        )
     for path, value in made.vae_tensors()[0].items():
         np.testing.assert_array_equal(got[f"vae/{path}"], value)
 
@@ -129,7 +147,10 @@ def test_text_to_video_is_widened_with_zeros(tmp_path, capsys):
     run("--wan", tmp_path / "wan", "--random", "encoder", "renderer", "vae", "--dry-run")
     assert "E1 widened from 16 to 36 channels with zeros" in capsys.readouterr().out
     plan, _ = convert.make_plan(
-        parse(convert.parser(), ["--wan", str(tmp_path / "wan"), "--random", "encoder", "renderer", "vae"])
+        parse(
+            convert.parser(),
+            ["--wan", str(tmp_path / "wan"), "--random", "encoder", "renderer", "vae"],
+        )
     )
     assert plan.config.dit.in_channels == 36 and not plan.config.dit.clip_dim
     (fill,) = [f for f in plan.fills if f.path == "dit/patch_embed/kernel"]
@@ -147,7 +168,9 @@ def test_vggt_alone_fills_the_aggregator(files, tmp_path):
     got = stored(tmp_path / "m")
     for path, value in tree.items():
         np.testing.assert_array_equal(got[path], value, err_msg=path)
-    initialised = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]["initialised"]
+    initialised = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"][
+        "initialised"
+    ]
     assert {p for p in initialised if p.startswith("encoder/")} == {
         p for p in got if p.startswith(("encoder/camera_mlp", "encoder/connector"))
     }
@@ -159,11 +182,27 @@ def test_initialised_leaves_are_those_of_a_fresh_model(files, monkeypatch):
     """One leaf of each kind: the values do not depend on which others there are."""
     import jax
 
-    arguments = ["--lagernvs", files["lagernvs"], "--random", "dit", "vae", "--preset", files["config"], "--seed", 5]
+    arguments = [
+        "--lagernvs",
+        files["lagernvs"],
+        "--random",
+        "dit",
+        "vae",
+        "--preset",
+        files["config"],
+        "--seed",
+        5,
+    ]
     plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in arguments]))
-    paths = ["dit/blocks/ffn/fc1/kernel", "fusion/geometry_adapter/kernel", "vae/decoder/conv_in/kernel"]
+    paths = [
+        "dit/blocks/ffn/fc1/kernel",
+        "fusion/geometry_adapter/kernel",
+        "vae/decoder/conv_in/kernel",
+    ]
     chosen = params.unflatten({path: plan.specs[path] for path in paths})
-    monkeypatch.setattr(model, "specs", lambda config: chosen)  # or initialising takes a minute of compiling
+    monkeypatch.setattr(
+        model, "specs", lambda config: chosen
+    )  # or initialising takes a minute of compiling
     fresh = params.flatten(model.init(jax.random.key(5), CONFIG))
     for path in paths:
         np.testing.assert_array_equal(importer.initial_leaf(path, plan), fresh[path], err_msg=path)
@@ -181,25 +220,40 @@ def framecrafter(cfg, seed=7, rank=2):
         lora[f"blocks/{layer}/lora_b"] = rng.standard_normal((cfg.depth, rank, d_out), np.float32)
     tensors = lora_export.export_lora(params.unflatten(lora), style="framecrafter")
     embed = rng.standard_normal((cfg.width, 36 + RAYS, 1, 2, 2), np.float32)
-    return lora, tensors | {"patch_embedding.weight": embed, "patch_embedding.bias": np.ones(cfg.width, np.float32)}
+    return lora, tensors | {
+        "patch_embedding.weight": embed,
+        "patch_embedding.bias": np.ones(cfg.width, np.float32),
+    }
 
 
 def test_framecrafter_is_merged_into_the_transformer(files, tmp_path):
     lora, tensors = framecrafter(CONFIG.dit)
     made.save(tmp_path / "fc.safetensors", tensors)
-    run(*everything(files), "--framecrafter", tmp_path / "fc.safetensors", "--dtype", "float32", "--out", tmp_path / "m")
+    run(
+        *everything(files),
+        "--framecrafter",
+        tmp_path / "fc.safetensors",
+        "--dtype",
+        "float32",
+        "--out",
+        tmp_path / "m",
+    )
     got, tree = stored(tmp_path / "m"), made.dit_tensors()[0]
     for layer in ("blocks/self_attn/q", "blocks/ffn/fc1"):
         want = tree[f"{layer}/kernel"] + lora[f"{layer}/lora_a"] @ lora[f"{layer}/lora_b"]
         np.testing.assert_allclose(got[f"dit/{layer}/kernel"], want, rtol=0, atol=1e-5)
-    np.testing.assert_array_equal(got["dit/blocks/self_attn/k/kernel"], tree["blocks/self_attn/k/kernel"])
+    np.testing.assert_array_equal(
+        got["dit/blocks/self_attn/k/kernel"], tree["blocks/self_attn/k/kernel"]
+    )
     whole = wan_dit.PATCH.to_ours(tensors["patch_embedding.weight"])
     np.testing.assert_array_equal(got["dit/patch_embed/kernel"], whole[:, :, :36])
     np.testing.assert_array_equal(got["dit/patch_embed/bias"], 1)
     # One photo, repeated four times in its slot, is embedded as by FrameCrafter.
     rays = np.random.default_rng(0).standard_normal(RAYS)
     ours = np.einsum("c,hwcd->hwd", np.tile(rays, 4), got["fusion/rays_embed/kernel"])
-    np.testing.assert_allclose(ours, np.einsum("c,hwcd->hwd", rays, whole[:, :, 36:]), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(
+        ours, np.einsum("c,hwcd->hwd", rays, whole[:, :, 36:]), rtol=0, atol=1e-5
+    )
 
 
 def test_a_whole_framecrafter_transformer(files, tmp_path):
@@ -208,9 +262,17 @@ def test_a_whole_framecrafter_transformer(files, tmp_path):
     tree, tensors = made.dit_tensors(cfg)
     made.save(tmp_path / "full.safetensors", tensors)
     arguments = ["--wan", tmp_path / "full.safetensors", "--random", "encoder", "renderer", "vae"]
-    plan, _ = convert.make_plan(parse(convert.parser(), [*map(str, arguments), "--preset", str(files["config"])]))
-    values = {f.path: f.make(f.source.read(f.key)) for f in plan.fills if "embed" in f.path and f.layer is None}
-    np.testing.assert_array_equal(values["dit/patch_embed/kernel"], tree["patch_embed/kernel"][:, :, :36])
+    plan, _ = convert.make_plan(
+        parse(convert.parser(), [*map(str, arguments), "--preset", str(files["config"])])
+    )
+    values = {
+        f.path: f.make(f.source.read(f.key))
+        for f in plan.fills
+        if "embed" in f.path and f.layer is None
+    }
+    np.testing.assert_array_equal(
+        values["dit/patch_embed/kernel"], tree["patch_embed/kernel"][:, :, :36]
+    )
     rays = np.split(values["fusion/rays_embed/kernel"], 4, axis=2)
     np.testing.assert_array_equal(rays[3], tree["patch_embed/kernel"][:, :, 36:] / 4)
 
@@ -224,13 +286,25 @@ def test_prompt_rows_from_a_umt5_encoder(tmp_path):
     tokenizers = pytest.importorskip("tokenizers")
     from roge_jax.weights.prompt import encode_prompt
 
-    words = tokenizers.Tokenizer(tokenizers.models.WordLevel({"<pad>": 0, "</s>": 1, "<unk>": 2, "a": 3, "room": 4}, "<unk>"))
+    words = tokenizers.Tokenizer(
+        tokenizers.models.WordLevel({"<pad>": 0, "</s>": 1, "<unk>": 2, "a": 3, "room": 4}, "<unk>")
+    )
     words.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
-    words.post_processor = tokenizers.processors.TemplateProcessing(single="$A </s>", special_tokens=[("</s>", 1)])
-    fast = transformers.PreTrainedTokenizerFast(tokenizer_object=words, eos_token="</s>", pad_token="<pad>", unk_token="<unk>")
+    words.post_processor = tokenizers.processors.TemplateProcessing(
+        single="$A </s>", special_tokens=[("</s>", 1)]
+    )
+    fast = transformers.PreTrainedTokenizerFast(
+        tokenizer_object=words, eos_token="</s>", pad_token="<pad>", unk_token="<unk>"
+    )
     fast.save_pretrained(tmp_path / "tokenizer")
     config = transformers.UMT5Config(
-        vocab_size=8, d_model=8, d_kv=4, d_ff=16, num_layers=2, num_heads=2, feed_forward_proj="gated-gelu"
+        vocab_size=8,
+        d_model=8,
+        d_kv=4,
+        d_ff=16,
+        num_layers=2,
+        num_heads=2,
+        feed_forward_proj="gated-gelu",
     )
     torch.manual_seed(0)
     net = transformers.UMT5EncoderModel(config).to(torch.bfloat16).float().eval()
@@ -252,11 +326,15 @@ def test_pytorch_files(files, tmp_path):
     torch = pytest.importorskip("torch")
     tree, tensors = made.recon_tensors()
     state = {
-        k: torch.from_numpy(v.view(np.uint16)).view(torch.bfloat16) if v.dtype == BF16 else torch.from_numpy(v)
+        k: torch.from_numpy(v.view(np.uint16)).view(torch.bfloat16)
+        if v.dtype == BF16
+        else torch.from_numpy(v)
         for k, v in tensors.items()
     }
     key = "renderer.final_layer.linear.weight"
-    state[key] = torch.nn.Parameter(state[key].t().contiguous().t())  # a parameter, with other strides
+    state[key] = torch.nn.Parameter(
+        state[key].t().contiguous().t()
+    )  # a parameter, with other strides
     base = torch.zeros(3, *state["renderer.tgt_norm.weight"].shape)
     base[1] = state["renderer.tgt_norm.weight"]
     state["renderer.tgt_norm.weight"] = base[1]  # a view into a larger storage
@@ -266,7 +344,10 @@ def test_pytorch_files(files, tmp_path):
     run("--wan", files["wan"], "--wan-vae", tmp_path / "Wan2.1_VAE.pth", "--lagernvs", tmp_path / "model.pt",
         "--preset", files["config"], "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
     got = stored(tmp_path / "m")
-    for path, value in {**tree, **{f"vae/{p}": x for p, x in made.vae_tensors()[0].items()}}.items():
+    for path, value in {
+        **tree,
+        **{f"vae/{p}": x for p, x in made.vae_tensors()[0].items()},
+    }.items():
         np.testing.assert_array_equal(got[path], value, err_msg=path)
     torch.save(state, tmp_path / "old.pt", _use_new_zipfile_serialization=False)
     with pytest.raises(UserError, match=r"old\.pt is not a PyTorch zip file"):
@@ -320,13 +401,20 @@ def test_pytorch_pickle_by_hand(tmp_path):
     file = pytorch_zip(tmp_path / "a.pt", tensor_pickle("(I2\nI3\nt", "(I1\nI2\nt", 1))
     source = sources.open_source(file)
     assert source.shapes == {"w": (2, 3)} and source.read("w").shape == (2, 3)
-    for shape, strides, start in (("(I2\nI9\nt", "(I9\nI1\nt", 0), ("(I4\nt", "(I1\nt", 13), ("(I4\nt", "(I-1\nt", 8)):
+    for shape, strides, start in (
+        ("(I2\nI9\nt", "(I9\nI1\nt", 0),
+        ("(I4\nt", "(I1\nt", 13),
+        ("(I4\nt", "(I-1\nt", 8),
+    ):
         with pytest.raises(UserError, match="reaches outside its storage"):
-            sources.open_source(pytorch_zip(tmp_path / "b.pt", tensor_pickle(shape, strides, start)))
+            sources.open_source(
+                pytorch_zip(tmp_path / "b.pt", tensor_pickle(shape, strides, start))
+            )
 
 
 @pytest.mark.parametrize(
-    "call", [(os.system, ("touch {mark}",)), (eval, ("open('{mark}', 'w')",)), (getattr, (os, "sep"))]
+    "call",
+    [(os.system, ("touch {mark}",)), (eval, ("open('{mark}', 'w')",)), (getattr, (os, "sep"))],
 )
 def test_a_pickle_cannot_execute_code(tmp_path, call):
     mark = tmp_path / "executed"
@@ -334,7 +422,9 @@ def test_a_pickle_cannot_execute_code(tmp_path, call):
 
     class Attack:
         def __reduce__(self):
-            return function, tuple(a.format(mark=mark) if isinstance(a, str) else a for a in arguments)
+            return function, tuple(
+                a.format(mark=mark) if isinstance(a, str) else a for a in arguments
+            )
 
     try:
         content = pickle.dumps({"w": Attack()}, protocol=2)
@@ -362,19 +452,47 @@ def test_wrong_family(files, tmp_path):
     fails(r"lagernvs\.safetensors holds LagerNVS .* but --wan takes", "--wan", lagernvs)
     fails(r"wan holds a Wan transformer .* but --lagernvs takes", "--lagernvs", wan)
     fails(r"holds LagerNVS .* but --vggt takes VGGT-1B", "--vggt", lagernvs)
-    fails(r"holds LagerNVS .* --wan-vae takes the Wan2.1 VAE", "--wan", wan, "--wan-vae", lagernvs, "--lagernvs", lagernvs, *preset)
+    fails(
+        r"holds LagerNVS .* --wan-vae takes the Wan2.1 VAE",
+        "--wan",
+        wan,
+        "--wan-vae",
+        lagernvs,
+        "--lagernvs",
+        lagernvs,
+        *preset,
+    )
     fails(r"--framecrafter takes FrameCrafter's LoRA", "--wan", wan, "--framecrafter", lagernvs)
-    made.save(tmp_path / "t5.safetensors", {"encoder.embed_tokens.weight": np.ones((2, 2), np.float32)})
+    made.save(
+        tmp_path / "t5.safetensors", {"encoder.embed_tokens.weight": np.ones((2, 2), np.float32)}
+    )
     fails("holds a T5 text encoder", "--wan", tmp_path / "t5.safetensors")
-    fails("width 128 with 3 blocks, and preset 'wan1.3b' has 1536", "--wan", wan, "--preset", "wan1.3b")
+    fails(
+        "width 128 with 3 blocks, and preset 'wan1.3b' has 1536",
+        "--wan",
+        wan,
+        "--preset",
+        "wan1.3b",
+    )
     fails("Unknown preset 'papr': did you mean 'paper'", "--wan", wan, "--preset", "papr")
-    fails("has no DINOv2 patch encoder", "--lagernvs", lagernvs, "--random", "dit", "vae", "--preset", "tiny")
+    fails(
+        "has no DINOv2 patch encoder",
+        "--lagernvs",
+        lagernvs,
+        "--random",
+        "dit",
+        "vae",
+        "--preset",
+        "tiny",
+    )
 
 
 def test_missing_parts(files, tmp_path):
     wan = files["wan"]
     fails("Nothing fills encoder, renderer: give --lagernvs", "--wan", wan)
-    fails("--random dit, but a file fills it", "--wan", wan, "--random", "dit", "encoder", "renderer")
+    fails(
+        "--random dit, but a file fills it", "--wan", wan, "--random", "dit", "encoder", "renderer"
+    )
     fails("--framecrafter holds changes", "--framecrafter", wan)
     fails("does not exist", "--wan", tmp_path / "nowhere.safetensors")
     (tmp_path / "empty").mkdir()
@@ -497,7 +615,16 @@ def test_a_killed_conversion_resumes_to_the_same_files(files, tmp_path, monkeypa
     done = int((tmp_path / "m.part" / importer.PROGRESS).read_text())
     assert 0 < done < 60
     with pytest.raises(UserError, match="was begun with another 'dtype'"):
-        run(*arguments, "--out", tmp_path / "m", "--dtype", "float32", "--shard-gb", "0.0005", "--resume")
+        run(
+            *arguments,
+            "--out",
+            tmp_path / "m",
+            "--dtype",
+            "float32",
+            "--shard-gb",
+            "0.0005",
+            "--resume",
+        )
     written = []
     write = shards.Shards.write
 
@@ -512,7 +639,9 @@ def test_a_killed_conversion_resumes_to_the_same_files(files, tmp_path, monkeypa
     names = sorted(p.name for p in (tmp_path / "whole").iterdir())
     assert sorted(p.name for p in (tmp_path / "m").iterdir()) == names
     for name in names:
-        assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+        assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), (
+            name
+        )
 
 
 def test_an_interrupt_keeps_what_is_done(files, tmp_path):
@@ -528,15 +657,23 @@ def test_an_interrupt_keeps_what_is_done(files, tmp_path):
         importer.write(plan, tmp_path / "m", progress=interrupt)
     assert (tmp_path / "m.part" / importer.PROGRESS).read_text() == "29"
     calls.clear()
-    importer.write(plan, tmp_path / "m", resume=True, progress=lambda done, total: calls.append((done, total)))
-    assert (tmp_path / "m" / "config.json").exists() and not (tmp_path / "m" / importer.PLAN).exists()
+    importer.write(
+        plan, tmp_path / "m", resume=True, progress=lambda done, total: calls.append((done, total))
+    )
+    assert (tmp_path / "m" / "config.json").exists() and not (
+        tmp_path / "m" / importer.PLAN
+    ).exists()
     assert all(a[0] < b[0] <= b[1] for a, b in itertools.pairwise(calls))
 
 
 def test_a_mistake_is_one_line_and_code_two(files, tmp_path, capsys):
     from roge_jax.entry import execute
 
-    code = execute(convert.main, convert.parser(), ["--wan", str(files["lagernvs"]), "--out", str(tmp_path / "m")])
+    code = execute(
+        convert.main,
+        convert.parser(),
+        ["--wan", str(files["lagernvs"]), "--out", str(tmp_path / "m")],
+    )
     printed = capsys.readouterr()
     assert code == 2 and printed.err.count("\n") == 1 and printed.err.startswith("error: ")
     assert "Traceback" not in printed.err and not list(tmp_path.iterdir())

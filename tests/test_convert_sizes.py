@@ -29,7 +29,9 @@ def released(tmp_path_factory):
     root = tmp_path_factory.mktemp("released")
     made.save_listing(root / "14b" / "diffusion_pytorch_model.safetensors", "wan21_i2v_14b_dit")
     made.save_listing(
-        root / "repo" / "transformer" / "diffusion_pytorch_model.safetensors", "wan21_i2v_14b_dit", "diffusers key"
+        root / "repo" / "transformer" / "diffusion_pytorch_model.safetensors",
+        "wan21_i2v_14b_dit",
+        "diffusers key",
     )
     made.save_listing(root / "repo" / "vae" / "model.safetensors", "wan21_vae", "diffusers key")
     made.save_listing(root / "1.3b" / "diffusion_pytorch_model.safetensors", "wan21_t2v_1_3b_dit")
@@ -41,14 +43,18 @@ def released(tmp_path_factory):
         index = root / folder / "diffusion_pytorch_model.safetensors.index.json"
         index.write_text(json.dumps({"weight_map": files}))
     made.save_listing(root / "lagernvs.safetensors", "lagernvs_encdec_vitb8")
-    made.save_listing(root / "full.safetensors", "lagernvs_encdec_vitb8_full_attention", prefix="module.")
+    made.save_listing(
+        root / "full.safetensors", "lagernvs_encdec_vitb8_full_attention", prefix="module."
+    )
     made.save_listing(root / "vggt.safetensors", "vggt_1b")
     return root
 
 
 def test_all_of_the_paper_maps_completely(released):
     for wan in ("14b", "repo"):
-        plan, filled = plan_of("--wan", released / wan, "--lagernvs", released / "lagernvs.safetensors")
+        plan, filled = plan_of(
+            "--wan", released / wan, "--lagernvs", released / "lagernvs.safetensors"
+        )
         assert plan.config == preset("paper")
         read = {part.role: len(part.fills) for part in filled}
         assert read == {"--wan": 1303, "--wan-vae": 194, "--lagernvs": 1537}
@@ -62,10 +68,19 @@ def test_all_of_the_paper_maps_completely(released):
 def test_smaller_and_other_checkpoints_map_completely(released):
     plan, filled = plan_of("--wan", released / "1.3b", "--vggt", released / "vggt.safetensors")
     assert plan.config == preset("wan1.3b")
-    assert {part.role: len(part.fills) for part in filled} == {"--wan": 825, "--wan-vae": 194, "--vggt": 1210}
+    assert {part.role: len(part.fills) for part in filled} == {
+        "--wan": 825,
+        "--wan-vae": 194,
+        "--vggt": 1210,
+    }
     plan, _ = plan_of("--wan", released / "t2v", "--lagernvs", released / "full.safetensors")
     cfg = plan.config
-    assert (cfg.dit.width, cfg.dit.in_channels, cfg.dit.clip_dim, cfg.renderer.attention) == (5120, 36, 0, "full")
+    assert (cfg.dit.width, cfg.dit.in_channels, cfg.dit.clip_dim, cfg.renderer.attention) == (
+        5120,
+        36,
+        0,
+        "full",
+    )
 
 
 # ---- memory --------------------------------------------------------------------------------------
@@ -106,7 +121,9 @@ def measured(tmp_path, first, second):
 
 def config_folder(folder, config: RoGeConfig):
     folder.mkdir()
-    (folder / "config.json").write_text(json.dumps({"format": 1, "config": to_dict(config), "provenance": {}}))
+    (folder / "config.json").write_text(
+        json.dumps({"format": 1, "config": to_dict(config), "provenance": {}})
+    )
     return folder
 
 
@@ -132,9 +149,13 @@ def test_memory_follows_the_largest_tensor_not_the_file(tmp_path):
     whole = [s for p, s in specs.items() if not p.startswith("dit/blocks/")]
     largest = max(8192 * 512 * 2, 4 * max(params.count({"": s}) for s in whole))
     bound = 3 * largest + 32e6
-    assert stacked > 1.5 * bound and size > 4 * bound  # gathering a leaf, or the file, would be seen
+    assert (
+        stacked > 1.5 * bound and size > 4 * bound
+    )  # gathering a leaf, or the file, would be seen
     before, after, loaded = measured(tmp_path, *commands)
-    print(f"peak {before / 1e6:.0f} MB, then {after / 1e6:.0f}, loaded {loaded / 1e6:.0f}; bound of growth {bound / 1e6:.0f}")
+    print(
+        f"peak {before / 1e6:.0f} MB, then {after / 1e6:.0f}, loaded {loaded / 1e6:.0f}; bound of growth {bound / 1e6:.0f}"
+    )
     assert after - before < bound, (after - before) / 1e6
     assert after < 1e9 + 3 * largest  # what is promised, all of Python and JAX included
     assert loaded - before > bound  # the measure sees a model in memory
@@ -161,9 +182,23 @@ def test_full_size_lagernvs_from_a_pytorch_file(tmp_path):
         return rule_tensor(number[key], key, shape, case.info["weights"]["rule"])
 
     file = made.save_torch(tmp_path / "model.pt", shapes, value, wrapper="model", dtypes=dtypes)
-    config = dataclasses.replace(preset("tiny"), encoder=preset("paper").encoder, renderer=preset("paper").renderer)
+    config = dataclasses.replace(
+        preset("tiny"), encoder=preset("paper").encoder, renderer=preset("paper").renderer
+    )
     folder = config_folder(tmp_path / "config", config)
-    command = ["--lagernvs", file, "--random", "vae", "dit", "--preset", folder, "--dtype", "float32", "--out", tmp_path / "m"]
+    command = [
+        "--lagernvs",
+        file,
+        "--random",
+        "vae",
+        "dit",
+        "--preset",
+        folder,
+        "--dtype",
+        "float32",
+        "--out",
+        tmp_path / "m",
+    ]
     (peak,) = measured(tmp_path, [], command)
     largest = max(4 * int(np.prod(shape)) for shape in shapes.values())
     assert peak < 3 * largest + 1e9, peak / 1e9
@@ -171,16 +206,23 @@ def test_full_size_lagernvs_from_a_pytorch_file(tmp_path):
     p, _ = checkpoint.load_model(tmp_path / "m", dtype=None)
     t, m, every = case.tensors, case.config["M"], case.config["token_stride"]
     images = jnp.moveaxis(jnp.asarray(t["in.images"][0]), -3, -1)
-    rays = jnp.moveaxis(jnp.asarray(t["in.rays_target"]), -3, -1)[..., jnp.asarray([3, 4, 5, 0, 1, 2])]
+    rays = jnp.moveaxis(jnp.asarray(t["in.rays_target"]), -3, -1)[
+        ..., jnp.asarray([3, 4, 5, 0, 1, 2])
+    ]
     unused = jnp.zeros((*images.shape[:3], 6))
     K = np.zeros((m, 3, 3), np.float32)
-    z = jax.jit(lambda p, x, v: vggt.encode_scene(p, x, v, unused, K, t["in.c2w"][:m], cfg=config.encoder))(
-        p["encoder"], images, t["in.cam11"]
-    )
+    z = jax.jit(
+        lambda p, x, v: vggt.encode_scene(p, x, v, unused, K, t["in.c2w"][:m], cfg=config.encoder)
+    )(p["encoder"], images, t["in.cam11"])
     assert rel_l2(z[:, ::every], np.asarray(t["mid.z0_sub"]).reshape(z[:, ::every].shape)) < 1e-5
-    phi = jax.jit(lambda p, z: ray_scene.query_rays(p, z, rays, cfg=config.renderer, contexts=m))(p["renderer"], z)
+    phi = jax.jit(lambda p, z: ray_scene.query_rays(p, z, rays, cfg=config.renderer, contexts=m))(
+        p["renderer"], z
+    )
     rgb = ray_scene.decode_rgb(p["renderer"]["rgb_head"], phi, cfg=config.renderer)
-    assert rel_l2(jnp.moveaxis(rgb, -1, -3), t["out.rgb"].reshape(np.moveaxis(rgb, -1, -3).shape)) < 1e-5
+    assert (
+        rel_l2(jnp.moveaxis(rgb, -1, -3), t["out.rgb"].reshape(np.moveaxis(rgb, -1, -3).shape))
+        < 1e-5
+    )
 
 
 @pytest.mark.slow
@@ -200,13 +242,29 @@ def test_full_size_text_to_video_transformer(tmp_path):
         for key, place in sources.open_source(wan / name).tensors.items():
             np.memmap(place.file, place.dtype, "r+", place.offset, place.shape)[...] = value(key)
         files |= dict.fromkeys(keys[i::3], name)
-    (wan / "diffusion_pytorch_model.safetensors.index.json").write_text(json.dumps({"weight_map": files}))
+    (wan / "diffusion_pytorch_model.safetensors.index.json").write_text(
+        json.dumps({"weight_map": files})
+    )
     config = dataclasses.replace(preset("tiny"), dit=preset("wan1.3b").dit)
     folder = config_folder(tmp_path / "config", config)
-    command = ["--wan", wan, "--random", "vae", "encoder", "renderer", "--preset", folder, "--out", tmp_path / "m"]
+    command = [
+        "--wan",
+        wan,
+        "--random",
+        "vae",
+        "encoder",
+        "renderer",
+        "--preset",
+        folder,
+        "--out",
+        tmp_path / "m",
+    ]
     (peak,) = measured(tmp_path, [], command)
     specs = params.flatten(model.specs(config))
-    largest = max(4 * max(int(np.prod(s)) for s in shapes.values()), 4 * params.count({"": specs["fusion/rays_embed/kernel"]}))
+    largest = max(
+        4 * max(int(np.prod(s)) for s in shapes.values()),
+        4 * params.count({"": specs["fusion/rays_embed/kernel"]}),
+    )
     assert peak < 3 * largest + 1e9, peak / 1e9
     leaves = {}
     for file in sorted((tmp_path / "m").glob("*.safetensors")):

@@ -18,7 +18,15 @@ from roge_jax.errors import UserError
 WORKER = Path(distributed_worker.__file__)
 
 
-def start(out: Path, count: int, data: int, fsdp: int, *options: str, lost: int | None = None, after: int = 0):
+def start(
+    out: Path,
+    count: int,
+    data: int,
+    fsdp: int,
+    *options: str,
+    lost: int | None = None,
+    after: int = 0,
+):
     """`count` processes that share data * fsdp CPU devices; process `lost` vanishes after step `after`."""
     with socket.socket() as s:
         s.bind(("127.0.0.1", 0))
@@ -87,7 +95,9 @@ class TestLaunchArguments:
     def test_alone(self):
         assert launch_arguments({}) is None
         assert launch_arguments({"RANK": "0", "WORLD_SIZE": "4"}) is None
-        assert launch_arguments({"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4"}) is None, "sbatch without srun"
+        assert launch_arguments({"SLURM_JOB_ID": "1", "SLURM_NTASKS": "4"}) is None, (
+            "sbatch without srun"
+        )
         assert launch_arguments({"SLURM_STEP_NUM_TASKS": "1"}) is None
 
     def test_by_hand(self):

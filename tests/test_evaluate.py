@@ -22,7 +22,14 @@ def tiny(tmp_path_factory):
 
 def test_results_follow_the_contract(tiny, tmp_path, capsys):
     out, sheet = tmp_path / "results.json", tmp_path / "sheet.png"
-    args = ["--checkpoint", str(tiny), "--scenes", "procedural:1000000000..1000000001", "--context", "2"]
+    args = [
+        "--checkpoint",
+        str(tiny),
+        "--scenes",
+        "procedural:1000000000..1000000001",
+        "--context",
+        "2",
+    ]
     args += ["--steps", "2", "--out", str(out), "--sheet", str(sheet)]
     evaluate.main(evaluate.parser().parse_args(args))
     results = json.loads(out.read_text())
@@ -41,7 +48,10 @@ def test_results_follow_the_contract(tiny, tmp_path, capsys):
 
 
 def test_contexts_are_spread_and_targets_are_the_rest():
-    assert evaluate.spread(20, 3, 17) == ([3, 10, 16], [i for i in range(20) if i not in (3, 10, 16)])
+    assert evaluate.spread(20, 3, 17) == (
+        [3, 10, 16],
+        [i for i in range(20) if i not in (3, 10, 16)],
+    )
     context, target = evaluate.spread(50, 3, 17)
     assert len(target) == 17 and min(context + target) == 15 and max(context + target) == 34
     with pytest.raises(UserError, match="--context"):

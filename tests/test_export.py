@@ -19,7 +19,9 @@ from roge_jax.weights import lora_export
 SMALL = dataclasses.replace(CONFIG, lora=LoraConfig(dit_rank=3, recon_rank=2))
 PROVENANCE = {
     "base": "weights/test",
-    "base_provenance": {"converted": [{"option": "--lagernvs", "tensors": 3}, {"option": "--wan", "tensors": 9}]},
+    "base_provenance": {
+        "converted": [{"option": "--lagernvs", "tensors": 3}, {"option": "--wan", "tensors": 9}]
+    },
     "stage": "lora",
     "steps": 20,
     "data": "procedural scenes",
@@ -37,7 +39,9 @@ def adapter():
     """What training changes: LoRA on both halves, E1 and the new embeddings."""
     full, _ = model.split(model.specs(SMALL), model.NEW_EMBEDDINGS)
     specs = params.flatten(full) | params.flatten(model.adapter_specs(SMALL))
-    return params.unflatten({p: 0.1 * x for p, x in random_tree(params.unflatten(specs), 2).items()})
+    return params.unflatten(
+        {p: 0.1 * x for p, x in random_tree(params.unflatten(specs), 2).items()}
+    )
 
 
 def run(*arguments):
@@ -52,9 +56,20 @@ def test_adapter_there_and_back(adapter, tmp_path):
     assert params.flatten(tree).keys() == want.keys()
     for path, value in params.flatten(tree).items():
         np.testing.assert_array_equal(value, want[path], err_msg=path)
-    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["README.md", "adapter.safetensors", "config.json"]
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == [
+        "README.md",
+        "adapter.safetensors",
+        "config.json",
+    ]
     card = (tmp_path / "a" / "README.md").read_text()
-    for words in ("license: other", "FAIR Noncommercial", "Apache-2.0", "procedural scenes", "Steps: 20", "rank 3"):
+    for words in (
+        "license: other",
+        "FAIR Noncommercial",
+        "Apache-2.0",
+        "procedural scenes",
+        "Steps: 20",
+        "rank 3",
+    ):
         assert words in card, words
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL)  # replaces it
     assert "not recorded" in (tmp_path / "a" / "README.md").read_text()
@@ -75,14 +90,19 @@ def test_merged_model_stands_alone(base, adapter, tmp_path, dtype):
     want = params.flatten(lora.merge(params.unflatten(params.flatten(stored) | full), factors))
     got = params.flatten(got)
     assert got.keys() == want.keys()
-    rounding = 2.0 ** (-8 if dtype == jnp.bfloat16 else -21)  # half a unit of bfloat16; the order of float32 sums
+    rounding = 2.0 ** (
+        -8 if dtype == jnp.bfloat16 else -21
+    )  # half a unit of bfloat16; the order of float32 sums
     for path, value in want.items():
         a, b = np.asarray(got[path], np.float32), np.asarray(value, np.float32)
         if path in full or "/kernel" not in path:
             np.testing.assert_array_equal(a, b, err_msg=path)
         else:
             np.testing.assert_allclose(a, b, rtol=rounding, atol=rounding, err_msg=path)
-    changed = np.abs(np.asarray(want["dit/blocks/self_attn/q/kernel"]) - base["dit"]["blocks"]["self_attn"]["q"]["kernel"])
+    changed = np.abs(
+        np.asarray(want["dit/blocks/self_attn/q/kernel"])
+        - base["dit"]["blocks"]["self_attn"]["q"]["kernel"]
+    )
     assert changed.max() > 0.05  # the comparison is not of two unmerged models
     provenance = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
     assert provenance["merged"]["steps"] == 20
@@ -105,7 +125,10 @@ def test_lora_of_the_transformer_for_other_programs(adapter, tmp_path, style, ca
     assert "retrained first embedding" in capsys.readouterr().out
     if style == "peft":
         record = json.loads((tmp_path / "out" / "adapter_config.json").read_text())
-        assert record["r"] == record["lora_alpha"] == 3 and "blocks.0.attn1.to_q" in record["target_modules"]
+        assert (
+            record["r"] == record["lora_alpha"] == 3
+            and "blocks.0.attn1.to_q" in record["target_modules"]
+        )
 
 
 def test_what_does_not_fit_is_named(base, adapter, tmp_path):
@@ -131,7 +154,9 @@ def test_what_does_not_fit_is_named(base, adapter, tmp_path):
     lone = params.flatten(adapter)
     del lone["dit/blocks/ffn/fc1/lora_b"]
     lone["dit/blocks/unknown/bias"] = np.ones(3)
-    with pytest.raises(UserError, match=r"2 mismatches\): dit/blocks/ffn/fc1/lora_a .* dit/blocks/unknown/bias"):
+    with pytest.raises(
+        UserError, match=r"2 mismatches\): dit/blocks/ffn/fc1/lora_a .* dit/blocks/unknown/bias"
+    ):
         checkpoint.save_adapter(tmp_path / "b", params.unflatten(lone), SMALL)
     content = (tmp_path / "a" / "adapter.safetensors").read_bytes()
     (tmp_path / "a" / "adapter.safetensors").write_bytes(content[:-5])

@@ -339,7 +339,11 @@ def arguments(*words):
 
 def test_defaults_are_the_contract():
     args = arguments()
-    assert (args.checkpoint, args.scene, args.trajectory) == ("mini", "motorcycle", "orbit:degrees=12")
+    assert (args.checkpoint, args.scene, args.trajectory) == (
+        "mini",
+        "motorcycle",
+        "orbit:degrees=12",
+    )
     assert (args.long, args.context_slots, args.fps, args.seed) == ("chain", "noised", 16.0, 0)
 
 

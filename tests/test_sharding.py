@@ -95,7 +95,9 @@ def test_transformer_equals_one_device():
     def loss(params, scenes):
         def one(x0, appearance, tokens):
             cond = model.Condition(appearance, tokens)
-            return model.flow_matching(params, x0, cond, jax.random.key(3), config=cfg, contexts=CONTEXTS)
+            return model.flow_matching(
+                params, x0, cond, jax.random.key(3), config=cfg, contexts=CONTEXTS
+            )
 
         over = jax.vmap(one, spmd_axis_name=sharding.batch_axes(SCENES))
         return over(scenes["x0"], scenes["appearance"], scenes["tokens"]).mean()
@@ -130,7 +132,9 @@ def test_loss_and_gradient_equal_one_device(problem, sizes):
     print(f"{sizes}: loss {abs(found / loss - 1):.1e}, entry {entry / norm:.1e}, leaf {leaf:.1e}")
     assert np.sqrt(sum(e**2 for e in error.values())) < 1e-5 * norm
     # Leaf by leaf; gradients of queries and keys are differences of nearly equal terms, hence the floor.
-    wrong = {p: e for p, e in error.items() if e > 1e-5 * max(np.linalg.norm(grads[p]), 1e-2 * norm)}
+    wrong = {
+        p: e for p, e in error.items() if e > 1e-5 * max(np.linalg.norm(grads[p]), 1e-2 * norm)
+    }
     assert not wrong
 
 
@@ -156,7 +160,11 @@ class TestMesh:
 
     def test_parse(self):
         assert sharding.parse_mesh("data=2, seq=4") == {"data": 2, "seq": 4}
-        for text, says in (("date=2", "data"), ("data=x", "data=NUMBER"), ("seq=1,seq=2", "must be one")):
+        for text, says in (
+            ("date=2", "data"),
+            ("data=x", "data=NUMBER"),
+            ("seq=1,seq=2", "must be one"),
+        ):
             with pytest.raises(UserError, match=says):
                 sharding.parse_mesh(text)
 
@@ -179,23 +187,40 @@ class TestTable:
         for name in ("wan1.3b", "paper"):
             specs = model.specs(config.preset(name))
             where = flatten(sharding.shardings(specs, mesh))
-            held = {p: int(np.prod(where[p].shard_shape(s.shape))) for p, s in flatten(specs).items()}
-            dit_share = sum(n for p, n in held.items() if p.startswith("dit/")) / count(specs["dit"])
+            held = {
+                p: int(np.prod(where[p].shard_shape(s.shape))) for p, s in flatten(specs).items()
+            }
+            dit_share = sum(n for p, n in held.items() if p.startswith("dit/")) / count(
+                specs["dit"]
+            )
             assert 0.125 < dit_share < 0.13, name
             assert sum(held.values()) < 0.2 * count(specs), name
 
     def test_a_size_that_does_not_divide(self):
-        specs = {"a": {"kernel": Spec((12, 5), ("embed", "mlp"))}, "b": {"kernel": Spec((4, 20), ("mlp", "embed"))}}
+        specs = {
+            "a": {"kernel": Spec((12, 5), ("embed", "mlp"))},
+            "b": {"kernel": Spec((4, 20), ("mlp", "embed"))},
+        }
         with pytest.raises(UserError) as error:
             sharding.shardings(specs, sharding.make_mesh(fsdp=8))
-        for part in ("a/kernel", "axis 0", "'embed'", "size 12", "fsdp=8", "1, 2, 3, 4, 6, 12", "1 more"):
+        for part in (
+            "a/kernel",
+            "axis 0",
+            "'embed'",
+            "size 12",
+            "fsdp=8",
+            "1, 2, 3, 4, 6, 12",
+            "1 more",
+        ):
             assert part in str(error.value)
         assert str(error.value).endswith("divide every leaf: 1, 2, 4.")
 
     def test_batch(self):
         mesh = sharding.make_mesh(2, 2, 2)
         assert sharding.batch_sharding(mesh, 8).spec == P(("data", "fsdp"))
-        assert sharding.batch_sharding(mesh, 2).spec == P("data"), "fsdp is left out where it does not divide"
+        assert sharding.batch_sharding(mesh, 2).spec == P("data"), (
+            "fsdp is left out where it does not divide"
+        )
         with pytest.raises(UserError, match="sizes that divide it: 1, 3"):
             sharding.batch_sharding(mesh, 3)
 
@@ -232,7 +257,9 @@ def test_checkpoint_moves_between_meshes(tmp_path):
     checkpoints.save(1, sharding.place(state, sharding.shardings(specs, meshes[0])))
     for mesh in meshes[1:]:
         where = sharding.shardings(specs, mesh)
-        like = jax.tree.map(lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), abstract(specs), where)
+        like = jax.tree.map(
+            lambda x, s: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=s), abstract(specs), where
+        )
         found = checkpoints.restore(like)
         assert found["x"]["kernel"].sharding == where["x"]["kernel"]
         for path, x in flatten(found).items():
@@ -264,10 +291,16 @@ class TestActivations:
         run = lambda p, x: dit.self_attention(p, x, angles, heads=cfg.heads)  # noqa: E731
         expected = jax.jit(run)(p, x)
         with sharding.use(sharding.make_mesh(seq=seq)):
-            program = jax.jit(lambda p, x: run(p, sharding.constrain(x, ("tokens", None)))).lower(p, x).compile()
+            program = (
+                jax.jit(lambda p, x: run(p, sharding.constrain(x, ("tokens", None))))
+                .lower(p, x)
+                .compile()
+            )
         np.testing.assert_allclose(program(p, x), expected, rtol=1e-5, atol=1e-5)
         by_heads = "all-to-all" in program.as_text()
-        assert by_heads == (cfg.heads % seq == 0), "heads divide: all-to-all; otherwise keys are gathered"
+        assert by_heads == (cfg.heads % seq == 0), (
+            "heads divide: all-to-all; otherwise keys are gathered"
+        )
         assert by_heads or "all-gather" in program.as_text()
 
 

@@ -172,7 +172,15 @@ def test_bfloat16_state_gets_worse_with_more_steps_and_float32_state_does_not():
 
 
 @pytest.mark.parametrize(
-    "name, limit", [("euler", 2.0), ("midpoint", 2.0), ("heun", 2.0), ("rk4", 2.785), ("rkc2", 9.5)]
+    "name, limit",
+    [
+        ("euler", 2.0),
+        ("midpoint", 2.0),
+        ("heun", 2.0),
+        ("rk4", 2.785),
+        ("rkc2", 9.5),
+        ("rkc2_8", 40.0),
+    ],
 )
 def test_stability_limits(name, limit):
     """Per step h: decaying modes of rate up to limit / h stay bounded, just beyond they grow."""
@@ -183,8 +191,8 @@ def test_stability_limits(name, limit):
         return abs(float(x0[0]))
 
     assert grown(80 * limit * 0.97) <= 1.0
-    # the stabilised method's bound is for 4 stages; 13.2 is beyond every real interval of it
-    assert grown(80 * (limit * 1.03 if name != "rkc2" else 13.2)) > 1.0
+    # the stabilised methods' intervals are known to 10 % only
+    assert grown(80 * limit * (1.2 if name.startswith("rkc2") else 1.03)) > 1.0
 
 
 def test_stiff_relaxation_stops_with_a_name_not_with_garbage():

@@ -39,7 +39,9 @@ def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
     run(*common, "--steps", 4, "--out", tmp_path, "--resume")
     assert losses(tmp_path / "lora") == whole
     again, _ = load_model(tmp_path / "lora/model")
-    assert all(np.array_equal(a, b) for a, b in zip(jax.tree.leaves(params), jax.tree.leaves(again)))
+    assert all(
+        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(params), jax.tree.leaves(again))
+    )
 
 
 def test_unknown_stage_and_batch_that_does_not_divide_are_refused(tmp_path):

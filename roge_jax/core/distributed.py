@@ -42,15 +42,23 @@ def launch_arguments(environment: Mapping[str, str]) -> dict[str, Any] | None:
             )
         address, count, index = (environment[name] for name in names)
         if not (count.isdecimal() and index.isdecimal() and int(index) < int(count)):
-            raise UserError(f"{names[1]}={count} and {names[2]}={index}: need a count, and an index below it.")
+            raise UserError(
+                f"{names[1]}={count} and {names[2]}={index}: need a count, and an index below it."
+            )
         if int(count) == 1:
             return None
         if ":" not in address:
             port = environment.get("MASTER_PORT", "")
             if not port.isdecimal():
-                raise UserError(f"{names[0]}={address} has no port: write host:port, or set MASTER_PORT.")
+                raise UserError(
+                    f"{names[0]}={address} has no port: write host:port, or set MASTER_PORT."
+                )
             address = f"{address}:{port}"
-        found = {"coordinator_address": address, "num_processes": int(count), "process_id": int(index)}
+        found = {
+            "coordinator_address": address,
+            "num_processes": int(count),
+            "process_id": int(index),
+        }
         if names[0] == "MASTER_ADDR" and environment.get("LOCAL_WORLD_SIZE", "1") != "1":
             found["local_device_ids"] = [int(environment["LOCAL_RANK"])]  # one process per device
         return found
@@ -82,7 +90,8 @@ def local_rows(mesh: Mesh | None, batch: int) -> np.ndarray:
     if mesh is None:
         return np.arange(batch)
     indices = batch_sharding(mesh, batch).addressable_devices_indices_map((batch,))
-    return np.unique(np.concatenate([np.arange(batch)[index[0]] for index in indices.values()]))
+    rows = [np.arange(batch)[index[0]] for index in indices.values() if index is not None]
+    return np.unique(np.concatenate(rows))
 
 
 def global_batch(local: Mapping[str, np.ndarray], mesh: Mesh, batch: int) -> dict[str, jax.Array]:
@@ -91,7 +100,9 @@ def global_batch(local: Mapping[str, np.ndarray], mesh: Mesh, batch: int) -> dic
 
     def leaf(name: str, x) -> jax.Array:
         x = np.asarray(x)
-        assert len(x) == len(rows), f"{name}: {len(x)} rows of this process, expected {len(rows)} of {batch}"
+        assert len(x) == len(rows), (
+            f"{name}: {len(x)} rows of this process, expected {len(rows)} of {batch}"
+        )
 
         def share(index):
             own = np.searchsorted(rows, np.arange(batch)[index[0]])

@@ -34,7 +34,9 @@ def linear(p: Tree, x: jax.Array) -> jax.Array:
 
 
 def norm_specs(d: int, *, bias=True) -> Tree:
-    return {"scale": Spec((d,), (None,), ones)} | ({"bias": Spec((d,), (None,), zeros)} if bias else {})
+    return {"scale": Spec((d,), (None,), ones)} | (
+        {"bias": Spec((d,), (None,), zeros)} if bias else {}
+    )
 
 
 def layer_norm(p: Tree, x: jax.Array, *, eps: float) -> jax.Array:

@@ -130,7 +130,9 @@ def check(params, specs, *, source: str = "parameters") -> None:
         if path in have and tuple(have[path].shape) != tuple(want[path].shape)
     ]
     if faults:
-        shown = "; ".join(faults[:20]) + (f"; and {len(faults) - 20} more" if len(faults) > 20 else "")
+        shown = "; ".join(faults[:20]) + (
+            f"; and {len(faults) - 20} more" if len(faults) > 20 else ""
+        )
         raise UserError(
             f"{source} does not fit this model ({len(faults)} mismatches): {shown}. "
             "Use the checkpoint's own config, or convert it for this preset."

@@ -57,7 +57,10 @@ TABLE: dict[str, Rule] = {
 
 
 def make_mesh(
-    data: int | None = None, fsdp: int = 1, seq: int = 1, devices: Sequence[jax.Device] | None = None
+    data: int | None = None,
+    fsdp: int = 1,
+    seq: int = 1,
+    devices: Sequence[jax.Device] | None = None,
 ) -> Mesh:
     """The mesh (data, fsdp, seq) over `devices` (default: all, of all processes); data=None takes what is left.
 
@@ -71,7 +74,9 @@ def make_mesh(
     if data is None and n % (fsdp * seq) == 0:
         data = n // (fsdp * seq)
     if data is None or data * fsdp * seq != n:
-        given = f"fsdp={fsdp}, seq={seq}" if data is None else f"data={data}, fsdp={fsdp}, seq={seq}"
+        given = (
+            f"fsdp={fsdp}, seq={seq}" if data is None else f"data={data}, fsdp={fsdp}, seq={seq}"
+        )
         raise UserError(f"A mesh of {given} does not make {n} devices: {_fitting(n, fsdp, seq)}.")
     return jax.make_mesh(
         (data, fsdp, seq), MESH_AXES, axis_types=(AxisType.Auto,) * 3, devices=devices
@@ -96,7 +101,9 @@ def parse_mesh(text: str) -> dict[str, int]:
         if name not in MESH_AXES:
             raise UserError(f"--mesh: unknown axis '{name}': {did_you_mean(name, MESH_AXES)}")
         if name in sizes or not value.isdecimal() or int(value) < 1:
-            raise UserError(f"--mesh: '{part.strip()}' must be one {name}=NUMBER: write data=2,fsdp=2,seq=2.")
+            raise UserError(
+                f"--mesh: '{part.strip()}' must be one {name}=NUMBER: write data=2,fsdp=2,seq=2."
+            )
         sizes[name] = int(value)
     return sizes
 
@@ -218,7 +225,8 @@ def describe(specs: Tree, mesh: Mesh) -> str:
         here, whole = here + share, whole + math.prod(spec.shape) * item
     widths = [max(len(row[i]) for row in rows) for i in range(4)]
     lines = [
-        f"{a:{widths[0]}}  {b:{widths[1]}}  {c:{widths[2]}}  {d:>{widths[3]}}".rstrip() for a, b, c, d in rows
+        f"{a:{widths[0]}}  {b:{widths[1]}}  {c:{widths[2]}}  {d:>{widths[3]}}".rstrip()
+        for a, b, c, d in rows
     ]
     sizes = ", ".join(f"{name}={size}" for name, size in mesh.shape.items())
     return "\n".join([f"mesh {sizes}", *lines, f"{here:,} of {whole:,} bytes on each device"])
@@ -275,7 +283,9 @@ def batch_axes(batch: int) -> tuple[str, ...] | None:
     return over or None
 
 
-def by_heads(q: jax.Array, k: jax.Array, v: jax.Array, dtype) -> tuple[jax.Array, jax.Array, jax.Array]:
+def by_heads(
+    q: jax.Array, k: jax.Array, v: jax.Array, dtype
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The border into attention over all tokens: q [l, heads, e], k and v [s, heads, e] of one scene.
 
     If `seq` divides the heads, each device takes all tokens of some heads: XLA makes all-to-alls of it, a quarter of
@@ -289,7 +299,9 @@ def by_heads(q: jax.Array, k: jax.Array, v: jax.Array, dtype) -> tuple[jax.Array
     if q.shape[-2] % ways("seq"):
         if jax.default_backend() == "gpu":
             fit = ", ".join(map(str, _divisors(q.shape[-2])))
-            raise UserError(f"seq={ways('seq')} does not divide {q.shape[-2]} attention heads: use one of {fit}.")
+            raise UserError(
+                f"seq={ways('seq')} does not divide {q.shape[-2]} attention heads: use one of {fit}."
+            )
         whole = (None, None, None)
         return constrain(q, ("tokens", None, None)), constrain(k, whole), constrain(v, whole)
     split = (None, "attention_heads", None)

@@ -90,7 +90,9 @@ def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray
     c2w [m + n, 4, 4], vectors [m, 11].
     """
     h, w = rgb.shape[1:3]
-    context, target, info = normalise(Cameras(K[:m], c2w[:m]), Cameras(K[m:], c2w[m:]), rule=scale_rule)
+    context, target, info = normalise(
+        Cameras(K[:m], c2w[:m]), Cameras(K[m:], c2w[m:]), rule=scale_rule
+    )
     return {
         "context_rgb": rgb[:m].astype(np.float32),
         "target_rgb": rgb[m:].astype(np.float32),
@@ -116,7 +118,9 @@ def draw_batch(
     m = int(rng.choice(cfg.contexts, p=weights))
     samples = []
     for j in range(batch) if rows is None else rows:
-        rng = np.random.default_rng([seed, index, 2 + int(j)])  # [.., 0] would repeat the stream of M
+        rng = np.random.default_rng(
+            [seed, index, 2 + int(j)]
+        )  # [.., 0] would repeat the stream of M
         sequence = pool[int(rng.integers(len(pool)))]
         contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
         views = np.concatenate([contexts, targets])

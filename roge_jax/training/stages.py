@@ -116,11 +116,15 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
         Stage("vae_longer", "vae", "^vae/", 200, 2, _SCRATCH, longer, crop=64),
-        Stage("recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2),
+        Stage(
+            "recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2
+        ),
         Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
         Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=6),
-        Stage("joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4),
+        Stage(
+            "joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4
+        ),
     ]
     return [dataclasses.replace(s, steps=max(1, round(s.steps * scale))) for s in stages]
 
@@ -181,9 +185,13 @@ def new_leaves(config: RoGeConfig, stage: Stage) -> Tree:
     return {"dit": adapters["dit"]} if stage.name == "hires" else adapters
 
 
-def measure_latents(params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32) -> RoGeConfig:
+def measure_latents(
+    params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32
+) -> RoGeConfig:
     """`config` with the mean and standard deviation per latent channel that this VAE has on training clips."""
-    stage = Stage("", "vae", "", 1, 1, OptimConfig(), ViewConfig(targets=config.frames, ordered=True))
+    stage = Stage(
+        "", "vae", "", 1, 1, OptimConfig(), ViewConfig(targets=config.frames, ordered=True)
+    )
     encode = jax.jit(functools.partial(vae.encode_moments, cfg=config.vae))
     found = []
     for i in range(clips):

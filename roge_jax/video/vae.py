@@ -408,7 +408,14 @@ def _passthrough(module: str, kernel: np.ndarray, noise: float) -> np.ndarray:
 
 
 def vae_loss(
-    p: Tree, video: jax.Array, key: jax.Array, *, cfg: VAEConfig, kl: float = 5e-5, l1: float = 0.1, chroma: float = 8.0
+    p: Tree,
+    video: jax.Array,
+    key: jax.Array,
+    *,
+    cfg: VAEConfig,
+    kl: float = 5e-5,
+    l1: float = 0.1,
+    chroma: float = 8.0,
 ) -> tuple[jax.Array, dict]:
     """Reconstruction of video [t, h, w, 3] from sampled latents: error + l1 * mae + kl * KL, means over elements.
 

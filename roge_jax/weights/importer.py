@@ -72,7 +72,9 @@ class Plan(NamedTuple):
         return HALF if self.half and stored_half(path) else DTYPES["F32"]
 
     def layout(self, shard_bytes: float = SHARD_BYTES) -> Layout:
-        return plan_shards({p: (s.shape, self.dtype(p)) for p, s in self.specs.items()}, shard_bytes)
+        return plan_shards(
+            {p: (s.shape, self.dtype(p)) for p, s in self.specs.items()}, shard_bytes
+        )
 
 
 def stored_half(path: str) -> bool:
@@ -84,7 +86,9 @@ def stored_half(path: str) -> bool:
     network, _, rest = path.partition("/")
     if not path.endswith("/kernel") or network not in ("encoder", "renderer", "dit"):
         return False
-    return network != "dit" or not (rest.startswith("patch_embed/") or re.search(FLOAT32_LEAVES, rest))
+    return network != "dit" or not (
+        rest.startswith("patch_embed/") or re.search(FLOAT32_LEAVES, rest)
+    )
 
 
 # ---- planning ------------------------------------------------------------------------------------
@@ -110,7 +114,9 @@ def plan_network(
         if key in names:
             stored = source.tensors[names[key]]
             if tuple(stored.shape) != want[key]:
-                faults.append(Fault(file, names[key], f"has shape {stored.shape} instead of {want[key]}"))
+                faults.append(
+                    Fault(file, names[key], f"has shape {stored.shape} instead of {want[key]}")
+                )
             if stored.dtype not in READABLE:
                 faults.append(Fault(file, names[key], _wrong_dtype(stored.dtype)))
     prefix = f"{network}/" if network else ""
@@ -161,7 +167,9 @@ def report(faults: Iterable[Fault]) -> None:
 def _ranges(numbers: list[int]) -> str:
     """[0, 1, 2, 5] -> "{0..2,5}"; a single number alone."""
     runs = []
-    for _, group in itertools.groupby(enumerate(sorted(set(numbers))), lambda pair: pair[1] - pair[0]):
+    for _, group in itertools.groupby(
+        enumerate(sorted(set(numbers))), lambda pair: pair[1] - pair[0]
+    ):
         run = [number for _, number in group]
         runs.append(str(run[0]) if len(run) == 1 else f"{run[0]}..{run[-1]}")
     return runs[0] if len(runs) == 1 and ".." not in runs[0] else "{" + ",".join(runs) + "}"
@@ -269,7 +277,9 @@ def _record(plan: Plan, layout: Layout) -> dict:
     """What two runs must share for one to continue the other."""
     files = {file for fill in plan.fills for file in fill.source.files}
     return {
-        "files": [[str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns] for f in sorted(files)],
+        "files": [
+            [str(f.resolve()), f.stat().st_size, f.stat().st_mtime_ns] for f in sorted(files)
+        ],
         "config": json.loads(json.dumps(to_dict(plan.config))),
         "pieces": [[fill.path, fill.layer, fill.key] for fill in plan.fills],
         "given": {p: hashlib.sha256(v.tobytes()).hexdigest() for p, v in plan.given.items()},

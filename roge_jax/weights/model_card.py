@@ -49,7 +49,9 @@ def adapter_card(leaves: Mapping[str, object], config: RoGeConfig, provenance: M
     ]
     for network, found in sorted(ranks.items()):
         layers = sum(path.startswith(f"{network}/") for path in factors)
-        lines.append(f"| `{network}` | LoRA of rank {', '.join(map(str, sorted(found)))} on {layers} kernels |")
+        lines.append(
+            f"| `{network}` | LoRA of rank {', '.join(map(str, sorted(found)))} on {layers} kernels |"
+        )
     if full:
         lines.append(f"| trained fully | {', '.join(f'`{p}`' for p in sorted(full))} |")
     lines += [
@@ -79,4 +81,7 @@ def _sources(provenance: Mapping) -> list[str]:
     read = dict.fromkeys(part["option"] for part in converted if part.get("tensors", 1))
     if not read:
         return ["The base's own licence (no published weights are recorded in its config.json)."]
-    return [f"{name}: {licence} ({place})" for name, licence, place in (LICENCES[o] for o in read if o in LICENCES)]
+    return [
+        f"{name}: {licence} ({place})"
+        for name, licence, place in (LICENCES[o] for o in read if o in LICENCES)
+    ]

@@ -24,7 +24,9 @@ def padded(rows: np.ndarray, cfg: DiTConfig, source: str) -> np.ndarray:
             f"with 1 to {cfg.text_len} rows."
         )
     if not np.isfinite(rows).all():
-        raise UserError(f"{source}: the prompt embedding is not finite: compute it in bfloat16 or float32.")
+        raise UserError(
+            f"{source}: the prompt embedding is not finite: compute it in bfloat16 or float32."
+        )
     return np.pad(rows, ((0, cfg.text_len - rows.shape[0]), (0, 0)))
 
 
@@ -37,10 +39,14 @@ def read_prompt(file: Path, cfg: DiTConfig) -> np.ndarray:
         except (OSError, ValueError) as error:
             if isinstance(error, UserError):
                 raise
-            raise UserError(f"{file} cannot be read as .npy ({error}): save the rows with numpy.save.") from None
+            raise UserError(
+                f"{file} cannot be read as .npy ({error}): save the rows with numpy.save."
+            ) from None
     source = open_source(file)
     if len(source.tensors) != 1:
-        raise UserError(f"{file} holds {len(source.tensors)} tensors: give a file with the embedding alone.")
+        raise UserError(
+            f"{file} holds {len(source.tensors)} tensors: give a file with the embedding alone."
+        )
     (key,) = source.tensors
     return padded(source.read(key), cfg, str(file))
 
@@ -61,9 +67,13 @@ def encode_prompt(folder: Path, text: str, cfg: DiTConfig) -> np.ndarray:
     tokens = folder / "tokenizer" if (folder / "tokenizer").is_dir() else folder
     try:
         tokenizer = AutoTokenizer.from_pretrained(str(tokens), local_files_only=True)
-        model = UMT5EncoderModel.from_pretrained(str(encoder), dtype=torch.bfloat16, local_files_only=True)
+        model = UMT5EncoderModel.from_pretrained(
+            str(encoder), dtype=torch.bfloat16, local_files_only=True
+        )
     except (OSError, ValueError, ImportError) as error:
-        raise UserError(f"--t5 {folder}: no umT5 encoder and tokenizer there ({_first_line(error)}).") from None
+        raise UserError(
+            f"--t5 {folder}: no umT5 encoder and tokenizer there ({_first_line(error)})."
+        ) from None
     ids = tokenizer(cleaned(text), truncation=True, max_length=cfg.text_len, return_tensors="pt")
     with torch.no_grad():
         rows = model.eval()(input_ids=ids["input_ids"], attention_mask=ids["attention_mask"])

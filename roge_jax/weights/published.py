@@ -164,7 +164,9 @@ def widened(fills: list[Fill], channels: int, wanted: int) -> tuple[list[Fill], 
             fill = fill._replace(make=functools.partial(pad, fill.make))
         elif fill.path == f"dit/{E1}" and -more == RAYS:
             extra.append(
-                fill._replace(path="fusion/rays_embed/kernel", make=functools.partial(rays, fill.make))
+                fill._replace(
+                    path="fusion/rays_embed/kernel", make=functools.partial(rays, fill.make)
+                )
             )
             fill = fill._replace(make=functools.partial(first, fill.make))
         result.append(fill)
@@ -176,7 +178,10 @@ class _Adapter:
 
     def __init__(self, source: Source, cfg: DiTConfig):
         self.source, self.cfg = source, cfg
-        zeros = {key: np.broadcast_to(np.zeros((), np.float32), t.shape) for key, t in source.tensors.items()}
+        zeros = {
+            key: np.broadcast_to(np.zeros((), np.float32), t.shape)
+            for key, t in source.tensors.items()
+        }
         self.lora, rest = self._factors(zeros)
         self.rest = {bare: key for bare, key in self._bare().items() if bare in rest}
 
@@ -196,11 +201,16 @@ class _Adapter:
         specs = flatten(dit_specs(self.cfg))
         file = str(self.source.path)
         faults = [
-            Fault(file, path.replace("/", "."), f"has shape {tuple(x.shape)}, which does not fit {specs[kernel].shape}")
+            Fault(
+                file,
+                path.replace("/", "."),
+                f"has shape {tuple(x.shape)}, which does not fit {specs[kernel].shape}",
+            )
             for path, x in self.lora.items()
             for kernel in [path.rpartition("/")[0] + "/kernel"]
             if x.shape[0] != specs[kernel].shape[0]
-            or x.shape[-2 if path.endswith("a") else -1] != specs[kernel].shape[-2 if path.endswith("a") else -1]
+            or x.shape[-2 if path.endswith("a") else -1]
+            != specs[kernel].shape[-2 if path.endswith("a") else -1]
         ]
         embed = dataclasses.replace(self.cfg, in_channels=self.cfg.in_channels + RAYS)
         part = {p: s for p, s in flatten(dit_specs(embed)).items() if p.startswith("patch_embed/")}
@@ -209,7 +219,9 @@ class _Adapter:
         fills, rays = widened(fills, self.cfg.in_channels + RAYS, self.cfg.in_channels)
         rank = next(x.shape[-1] for path, x in self.lora.items() if path.endswith("lora_a"))
         note = f"LoRA of rank {rank} merged into {len(self.lora) // 2} kernels"
-        return Filled("--framecrafter", self.source, "LoRA", fills + rays, faults + more, (note, _RAYS_NOTE))
+        return Filled(
+            "--framecrafter", self.source, "LoRA", fills + rays, faults + more, (note, _RAYS_NOTE)
+        )
 
     def merged(self, fill: Fill, cfg: DiTConfig) -> Fill:
         """The fill with kernel + a @ b (in float32) where this file adapts the kernel."""
@@ -219,7 +231,9 @@ class _Adapter:
 
         def make(x):
             pair = (self.values[f"{layer}/lora_{side}"] for side in "ab")
-            a, b = (np.asarray(f if fill.layer is None else f[fill.layer], np.float32) for f in pair)
+            a, b = (
+                np.asarray(f if fill.layer is None else f[fill.layer], np.float32) for f in pair
+            )
             kernel = a @ b
             kernel += fill.make(x)
             return kernel

@@ -70,7 +70,9 @@ def plan_shards(
                 "shape": list(shape),
                 "data_offsets": [begin, end],
             }
-        text = json.dumps({"__metadata__": {"format": "roge_jax"}, **entries}, separators=(",", ":"))
+        text = json.dumps(
+            {"__metadata__": {"format": "roge_jax"}, **entries}, separators=(",", ":")
+        )
         header = text.encode() + b" " * (-len(text.encode()) % 8)
         headers.append(len(header).to_bytes(8, "little") + header)
         sizes.append(len(headers[-1]) + end)
@@ -88,7 +90,9 @@ class Shards:
         self.files = []
         try:
             for i, (header, size) in enumerate(zip(layout.headers, layout.sizes, strict=True)):
-                self.files.append((folder / layout.name(i)).open("wb" if fresh else "r+b", buffering=0))
+                self.files.append(
+                    (folder / layout.name(i)).open("wb" if fresh else "r+b", buffering=0)
+                )
                 if fresh:
                     self.files[i].truncate(size)
                     if hasattr(os, "posix_fallocate"):
@@ -145,5 +149,7 @@ def _write_all(file, data) -> None:
 
 def _disk(error: OSError, place: Path) -> None:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        raise UserError(f"The disk is full at {place}: free some space or give another --out.") from None
+        raise UserError(
+            f"The disk is full at {place}: free some space or give another --out."
+        ) from None
     raise error

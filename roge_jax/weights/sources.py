@@ -32,7 +32,12 @@ SAFETENSORS = (".safetensors",)
 TORCH = (".pth", ".pt", ".bin", ".ckpt")
 INDEX = "*.safetensors.index.json"
 HEADER_LIMIT = 100_000_000  # bytes, as in the safetensors library
-WRAPPERS = ("model", "state_dict", "model_state_dict", "module")  # {"model": {key: tensor}, "step": 3}
+WRAPPERS = (
+    "model",
+    "state_dict",
+    "model_state_dict",
+    "module",
+)  # {"model": {key: tensor}, "step": 3}
 
 DTYPES = {
     "F64": np.dtype(np.float64),
@@ -127,7 +132,9 @@ def open_source(path: str | Path) -> Source:
     if path.is_dir():
         return Source(path, _folder(path))
     if not path.exists():
-        raise UserError(f"{path} does not exist: give a checkpoint file or the folder it was downloaded to.")
+        raise UserError(
+            f"{path} does not exist: give a checkpoint file or the folder it was downloaded to."
+        )
     if path.name.endswith(".index.json"):
         return Source(path, _indexed(path))
     if path.suffix in SAFETENSORS:
@@ -148,9 +155,13 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
         start = f.read(8)
         length = int.from_bytes(start, "little") if len(start) == 8 else HEADER_LIMIT + 1
         if length > HEADER_LIMIT:
-            raise UserError(f"{file} is not a safetensors file (or only its beginning): download it again.")
+            raise UserError(
+                f"{file} is not a safetensors file (or only its beginning): download it again."
+            )
         if size < 8 + length:
-            raise UserError(f"{file} is truncated ({size} bytes, its header alone needs {8 + length}): copy it again.")
+            raise UserError(
+                f"{file} is truncated ({size} bytes, its header alone needs {8 + length}): copy it again."
+            )
         try:
             header = json.loads(f.read(length))
             header.pop("__metadata__", None)
@@ -158,7 +169,9 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
         except (ValueError, AttributeError, KeyError, TypeError) as error:
             if isinstance(error, UserError):
                 raise
-            raise UserError(f"{file} has no readable safetensors header ({error}): download it again.") from None
+            raise UserError(
+                f"{file} has no readable safetensors header ({error}): download it again."
+            ) from None
     end = max((t.offset + t.nbytes for t in tensors.values()), default=0)
     if size < end:
         raise UserError(
@@ -169,7 +182,8 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
 
 def _first_beyond(tensors: Mapping[str, Stored], size: int) -> str:
     key, _ = min(
-        ((k, t) for k, t in tensors.items() if t.offset + t.nbytes > size), key=lambda item: item[1].offset
+        ((k, t) for k, t in tensors.items() if t.offset + t.nbytes > size),
+        key=lambda item: item[1].offset,
     )
     return f"tensor '{key}'"
 
@@ -178,9 +192,13 @@ def _stored(file: Path, base: int, key: str, entry: dict) -> Stored:
     if entry["dtype"] not in DTYPES:
         raise UserError(f"{file}: tensor '{key}' has dtype {entry['dtype']}, which cannot be read.")
     begin, end = entry["data_offsets"]
-    stored = Stored(file, base + begin, tuple(map(operator.index, entry["shape"])), DTYPES[entry["dtype"]])
+    stored = Stored(
+        file, base + begin, tuple(map(operator.index, entry["shape"])), DTYPES[entry["dtype"]]
+    )
     if begin < 0 or min(stored.shape, default=0) < 0 or end - begin != stored.nbytes:
-        raise UserError(f"{file}: tensor '{key}' of shape {stored.shape} does not fill its {end - begin} bytes.")
+        raise UserError(
+            f"{file}: tensor '{key}' of shape {stored.shape} does not fill its {end - begin} bytes."
+        )
     return stored
 
 
@@ -194,14 +212,18 @@ def _folder(folder: Path) -> dict[str, Stored]:
         return _shards(folder, files, int(next(iter(shards.values()))[2]))
     if len(indexes) > 1 or len(files) > 1:
         names = ", ".join(f.name for f in indexes or files)
-        raise UserError(f"{folder} holds more than one checkpoint ({names}): give one of these files.")
+        raise UserError(
+            f"{folder} holds more than one checkpoint ({names}): give one of these files."
+        )
     if files:
         return read_safetensors_header(files[0])
     torch = sorted(f for f in folder.iterdir() if f.suffix in TORCH)
     if len(torch) == 1:
         return read_torch_header(torch[0])
     found = ", ".join(f.name for f in torch) or "none"
-    raise UserError(f"{folder} holds no safetensors (PyTorch files there: {found}): give the weight file itself.")
+    raise UserError(
+        f"{folder} holds no safetensors (PyTorch files there: {found}): give the weight file itself."
+    )
 
 
 def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:
@@ -209,7 +231,9 @@ def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:
     have = {int(f.stem.rpartition("-of-")[0].rpartition("-")[2]) for f in files}
     lost = sorted(set(range(1, count + 1)) - have)
     if lost:
-        raise UserError(f"{folder} is incomplete: shard {lost[0]} of {count} is missing ({len(lost)} in all).")
+        raise UserError(
+            f"{folder} is incomplete: shard {lost[0]} of {count} is missing ({len(lost)} in all)."
+        )
     tensors: dict[str, Stored] = {}
     for file in files:
         tensors |= read_safetensors_header(file)
@@ -221,19 +245,27 @@ def _indexed(index: Path) -> dict[str, Stored]:
         files: dict[str, str] = json.loads(index.read_text())["weight_map"]
         names = sorted(set(files.values()))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{index} is not an index of safetensors shards ({error!r}): download it again.") from None
+        raise UserError(
+            f"{index} is not an index of safetensors shards ({error!r}): download it again."
+        ) from None
     unsafe = [name for name in names if Path(name).name != name]
     if unsafe:
-        raise UserError(f"{index} points outside its own folder ('{unsafe[0]}'): download it again.")
+        raise UserError(
+            f"{index} points outside its own folder ('{unsafe[0]}'): download it again."
+        )
     lost = [name for name in names if not (index.parent / name).exists()]
     if lost:
-        raise UserError(f"{index.parent} is incomplete: {', '.join(lost)} missing ({index.name} lists them).")
+        raise UserError(
+            f"{index.parent} is incomplete: {', '.join(lost)} missing ({index.name} lists them)."
+        )
     tensors: dict[str, Stored] = {}
     for name in names:
         shard = read_safetensors_header(index.parent / name)
         absent = [key for key, file in files.items() if file == name and key not in shard]
         if absent:
-            raise UserError(f"{index.parent / name} lacks tensor '{absent[0]}', which {index.name} says it holds.")
+            raise UserError(
+                f"{index.parent / name} lacks tensor '{absent[0]}', which {index.name} says it holds."
+            )
         tensors |= shard
     return tensors
 
@@ -254,26 +286,40 @@ def read_torch_header(file: Path) -> dict[str, Stored]:
     except zipfile.BadZipFile:
         with file.open("rb") as f:
             cut = f.read(2) == b"PK"
-        what = "is truncated" if cut else "is not a PyTorch zip file (saved before version 1.6, or damaged)"
+        what = (
+            "is truncated"
+            if cut
+            else "is not a PyTorch zip file (saved before version 1.6, or damaged)"
+        )
         raise UserError(f"{file} {what}: download it again, or save it as safetensors.") from None
     with archive:
-        pickles = [name for name in archive.namelist() if name.endswith("/data.pkl") and name.count("/") == 1]
+        pickles = [
+            name
+            for name in archive.namelist()
+            if name.endswith("/data.pkl") and name.count("/") == 1
+        ]
         if len(pickles) != 1:
             raise UserError(f"{file} is a zip file, but no PyTorch checkpoint: it has no data.pkl.")
         root = pickles[0].removesuffix("data.pkl")
         places = {i.filename.removeprefix(root + "data/"): i for i in archive.infolist()}
         order = f"{root}byteorder"
         if order in archive.namelist() and archive.read(order) != b"little":
-            raise UserError(f"{file} was written on a big-endian machine: save it again on a usual one.")
+            raise UserError(
+                f"{file} was written on a big-endian machine: save it again on a usual one."
+            )
         try:
             content = _Unpickler(file, archive.read(pickles[0]), places).load()
         except UserError:
             raise
         except Exception as error:  # a damaged pickle can fail in any way
-            raise UserError(f"{file} cannot be read ({type(error).__name__}: {error}): download it again.") from None
+            raise UserError(
+                f"{file} cannot be read ({type(error).__name__}: {error}): download it again."
+            ) from None
     tensors = _find_tensors(content)
     if not tensors:
-        raise UserError(f"{file} holds no tensors by name: give the weights, not the optimiser or a whole module.")
+        raise UserError(
+            f"{file} holds no tensors by name: give the weights, not the optimiser or a whole module."
+        )
     return tensors
 
 
@@ -302,7 +348,9 @@ class _Unpickler(pickle.Unpickler):
         known = {
             ("collections", "OrderedDict"): collections.OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): lambda *args: self._tensor(*args[:4]),
-            ("torch._utils", "_rebuild_tensor_v3"): lambda *args: self._typed(args[0], args[1], args[2], args[3], args[6]),
+            ("torch._utils", "_rebuild_tensor_v3"): lambda *args: self._typed(
+                args[0], args[1], args[2], args[3], args[6]
+            ),
             ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
             ("torch", "Size"): lambda sizes=(): tuple(sizes),
         }
@@ -323,17 +371,27 @@ class _Unpickler(pickle.Unpickler):
 
     def _storage(self, key: str, dtype: np.dtype, count: int) -> _Storage:
         if key not in self.places:
-            raise UserError(f"{self.file} is incomplete: its storage '{key}' is missing; download it again.")
+            raise UserError(
+                f"{self.file} is incomplete: its storage '{key}' is missing; download it again."
+            )
         info = self.places[key]
         if info.compress_type != zipfile.ZIP_STORED:
-            raise UserError(f"{self.file} is compressed, unlike PyTorch's own files: unpack and save it again.")
+            raise UserError(
+                f"{self.file} is compressed, unlike PyTorch's own files: unpack and save it again."
+            )
         if count * dtype.itemsize > info.file_size:
-            raise UserError(f"{self.file} is damaged: storage '{key}' is shorter than its {count} elements.")
-        with self.file.open("rb") as f:  # the bytes begin after the local header, whose length the index does not tell
+            raise UserError(
+                f"{self.file} is damaged: storage '{key}' is shorter than its {count} elements."
+            )
+        with self.file.open(
+            "rb"
+        ) as f:  # the bytes begin after the local header, whose length the index does not tell
             f.seek(info.header_offset)
             local = f.read(30)
         if local[:4] != b"PK\x03\x04":
-            raise UserError(f"{self.file} is damaged: storage '{key}' is not where its index says; download it again.")
+            raise UserError(
+                f"{self.file} is damaged: storage '{key}' is not where its index says; download it again."
+            )
         name, extra = struct.unpack("<HH", local[26:30])
         return _Storage(info.header_offset + 30 + name + extra, dtype, count)
 
@@ -343,12 +401,16 @@ class _Unpickler(pickle.Unpickler):
         elements = storage.elements * storage.dtype.itemsize // kind.itemsize
         return self._tensor(_Storage(storage.offset, kind, elements), start, shape, strides)
 
-    def _tensor(self, storage: _Storage, start: int, shape: tuple[int, ...], strides: tuple[int, ...]) -> Stored:
+    def _tensor(
+        self, storage: _Storage, start: int, shape: tuple[int, ...], strides: tuple[int, ...]
+    ) -> Stored:
         shape, strides = tuple(map(int, shape)), tuple(map(int, strides))
         last = sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
         inside = start >= 0 and min((*shape, *strides), default=0) >= 0
         if not inside or (0 not in shape and start + last >= storage.elements):
-            raise UserError(f"{self.file} is damaged: a tensor of shape {shape} reaches outside its storage.")
+            raise UserError(
+                f"{self.file} is damaged: a tensor of shape {shape} reaches outside its storage."
+            )
         contiguous = [1]  # from the last axis on; Python's integers do not overflow
         for n in shape[:0:-1]:
             contiguous.insert(0, n * contiguous[0])
