@@ -5,7 +5,8 @@
     python -m roge_jax.train mini --stage recon --init runs/mini/recon_low/model  one stage from any model folder
     python -m roge_jax.train tiny --steps 20               seconds, random weights
 
-Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) and model/ (weights + config to load).
+Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) and model/ (weights + config to load);
+lora and hires also adapter/ (what they changed, with a model card: see roge_jax.export).
 """
 
 import argparse
@@ -74,6 +75,13 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
     p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
+    p.add_argument(
+        "--diagnose-every",
+        type=int,
+        default=0,
+        help="steps between gradient norms of the two loss terms, their cosine, and the flow loss by\n"
+        "noise level (joint stages)",
+    )
     p.add_argument(
         "--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes"
     )
@@ -263,6 +271,11 @@ def run_stage(args, stage, params, cfg, mesh=None):
     evaluate = None
     if args.evaluate_every:
         evaluate = stages.held_out(objective, frozen, stage, working)
+    diagnose = None
+    if args.diagnose_every and stage.objective == "joint":
+        from .training.diagnose import joint_diagnose
+
+        diagnose = joint_diagnose(working)
     state = loop.train(
         objective,
         trainable,
@@ -281,6 +294,8 @@ def run_stage(args, stage, params, cfg, mesh=None):
         name=stage.name,
         evaluate=evaluate,
         evaluate_every=args.evaluate_every,
+        diagnose=diagnose,
+        diagnose_every=args.diagnose_every,
         writer=writer,
     )
     learned = state.get("ema", state["params"])
@@ -300,6 +315,9 @@ def run_stage(args, stage, params, cfg, mesh=None):
         checkpoint.save_model(
             out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
         )
+        if stage.lora:
+            base = {"base": args.init or args.preset, "data": str(args.data or "procedural scenes")}
+            checkpoint.save_adapter(out / "adapter", learned, cfg, provenance | base)
     say(f"{stage.name}: saved {out / 'model'}")
     return params, cfg
 
