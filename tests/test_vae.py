@@ -278,7 +278,7 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     key = jax.random.key(8)
     loss = jax.jit(
         jax.value_and_grad(
-            functools.partial(vae.vae_loss, cfg=SMALL, kl=0.5, l1=0.25), has_aux=True
+            functools.partial(vae.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, chroma=3.0), has_aux=True
         )
     )
     (value, metrics), grads = loss(passthrough, video[:1], key)
@@ -288,7 +288,10 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     var = np.exp(log_var)
     kl = np.mean(-0.5 * (1 + log_var - mu**2 - var))
     mse, mae = np.mean(error**2), np.mean(np.abs(error))
-    np.testing.assert_allclose(value, mse + 0.25 * mae + 0.5 * kl, rtol=1e-5)
+    weighted = mse + 2.0 * np.mean(
+        error.var(-1)
+    )  # mse = brightness + colour, colour counted 3 times
+    np.testing.assert_allclose(value, weighted + 0.25 * mae + 0.5 * kl, rtol=1e-5)
     np.testing.assert_allclose(metrics["psnr"], 20 * np.log10(2) - 10 * np.log10(mse), rtol=1e-5)
 
     for path, grad in flatten(grads).items():
