@@ -278,7 +278,8 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     key = jax.random.key(8)
     loss = jax.jit(
         jax.value_and_grad(
-            functools.partial(vae.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, chroma=3.0), has_aux=True
+            functools.partial(vae.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, colour=(1.0, 3.0, 5.0)),
+            has_aux=True,
         )
     )
     (value, metrics), grads = loss(passthrough, video[:1], key)
@@ -288,9 +289,9 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     var = np.exp(log_var)
     kl = np.mean(-0.5 * (1 + log_var - mu**2 - var))
     mse, mae = np.mean(error**2), np.mean(np.abs(error))
-    weighted = mse + 2.0 * np.mean(
-        error.var(-1)
-    )  # mse = brightness + colour, colour counted 3 times
+    green = (2 * error[..., 1] - error[..., 0] - error[..., 2]) ** 2 / 6
+    colour = 3 * error.var(-1)  # both colour axes
+    weighted = mse + np.mean(2.0 * colour + 2.0 * green) / 3  # 3 times red-blue, 5 times green
     np.testing.assert_allclose(value, weighted + 0.25 * mae + 0.5 * kl, rtol=1e-5)
     np.testing.assert_allclose(metrics["psnr"], 20 * np.log10(2) - 10 * np.log10(mse), rtol=1e-5)
 

@@ -6,8 +6,6 @@ published weights compute); `shared` refines them once, by the rays of the conte
 that (an approximation that costs about half).
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 
@@ -211,7 +209,6 @@ def query_rays(
             lead = Relative(rays.project[:contexts], rays.unproject[:contexts], rays.angles)
         levels = shared_levels(p, z, plucker[:contexts], cfg=cfg, rays=lead, cameras=cameras)
 
-    @functools.partial(jax.checkpoint, static_argnums=())
     def some(plucker, project, unproject):
         plucker = constrain(plucker, ("views", None, None, None))
         own = None if rays is None else Relative(project, unproject, rays.angles)
@@ -232,8 +229,10 @@ def query_rays(
             # A chunk takes every `chunks`-th view: devices that share chunks keep neighbouring views.
             return jnp.swapaxes(t.reshape(cfg.chunk, chunks, *t.shape[1:]), 0, 1)
 
+        # Every block is checkpointed already; the outer one keeps a single chunk's blocks in memory at a time.
         x, out = jax.lax.map(
-            lambda args: some(*args), tuple(split(t) for t in (plucker, project, unproject))
+            jax.checkpoint(lambda args: some(*args)),
+            tuple(split(t) for t in (plucker, project, unproject)),
         )
         x = jnp.swapaxes(x, 0, 1).reshape(chunks * cfg.chunk, *x.shape[2:])[:v]
     features = x.reshape(v, h // cfg.patch, w // cfg.patch, -1)

@@ -24,6 +24,7 @@ from ..core.params import Spec, Tree, fan_in, flatten, unflatten, zeros
 from ..errors import UserError
 
 SPACE, TIME = 8, 4  # compression
+OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # colour axes
 Past = (
     dict | None
 )  # what earlier chunks leave behind, shaped like the network; None: there are none
@@ -415,13 +416,13 @@ def vae_loss(
     cfg: VAEConfig,
     kl: float = 5e-5,
     l1: float = 0.1,
-    chroma: float = 8.0,
+    colour: tuple[float, float, float] = (1.0, 8.0, 16.0),
 ) -> tuple[jax.Array, dict]:
     """Reconstruction of video [t, h, w, 3] from sampled latents: error + l1 * mae + kl * KL, means over elements.
 
-    The squared error weighs differences between the colour channels `chroma` times as much as brightness. They are
-    a hundredth of its variance; unweighted, a small VAE stays grey for thousands of steps (neither half gains by
-    passing on colours that the other ignores).
+    `colour` weighs the squared error along the orthonormal axes grey, red against blue and green against magenta. The
+    last two hold one and two hundredths of the variance of brightness; unweighted, a small VAE stays grey for
+    thousands of steps (neither half gains by passing on colours that the other ignores).
 
     Also returns {"mse", "mae", "kl", "psnr"}; the PSNR (dB, range 2) is that of the sampled reconstruction.
     """
@@ -431,8 +432,7 @@ def vae_loss(
     z = mu + jnp.exp(0.5 * log_var) * jax.random.normal(key, mu.shape)
     error = decode_raw(p, z, cfg=cfg) - video
     mse, mae = jnp.square(error).mean(), jnp.abs(error).mean()
-    grey = error.mean(-1, keepdims=True)
-    weighted = jnp.square(grey).mean() + chroma * jnp.square(error - grey).mean()
+    weighted = jnp.square(error @ (OPPONENT.T * np.sqrt(colour)[None, :])).mean()
     divergence = 0.5 * (jnp.square(mu) + jnp.exp(log_var) - 1 - log_var).mean()
     psnr = 10 * jnp.log10(4 / jnp.maximum(mse, 1e-12))
     metrics = {"mse": mse, "mae": mae, "kl": divergence, "psnr": psnr}
