@@ -24,12 +24,12 @@ from .config import RoGeConfig
 from .core.lora import attach, lora_specs
 from .core.params import Spec, Tree, flatten, unflatten, zeros
 from .core.params import init as init_specs
-from .core.sharding import batch_axes
+from .core.sharding import batch_axes, current
 from .fusion import Condition
 from .geometry.rays import plucker
 from .recon import ray_scene, vggt
 from .recon.relative import Relative, relative_cameras
-from .video import dit, flow, solvers, vae
+from .video import dit, flow, solvers, vae, vae_training
 
 ContextSlots = Literal["noised", "clean", "free"]
 Views = dict[str, jax.Array]
@@ -58,7 +58,7 @@ def specs(config: RoGeConfig) -> Tree:
 def init(key: jax.Array, config: RoGeConfig) -> Tree:
     """Random parameters (the VAE from its pass-through initialisation)."""
     tree = init_specs(key, {k: s for k, s in specs(config).items() if k != "vae"})
-    return tree | {"vae": vae.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
+    return tree | {"vae": vae_training.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
 
 
 def adapter_specs(config: RoGeConfig) -> Tree:
@@ -312,6 +312,17 @@ def scene_loss(
     }
 
 
+def over_scenes(f: Callable, *batch):
+    """f(*scene) of every scene of a batch (leading axis of every array): all at once, or one by one on a lone CPU.
+
+    One scene's matrix products fill a CPU, and the gradients of batched products are slow there (see `matmul`).
+    """
+    if jax.default_backend() == "cpu" and current() is None:
+        return jax.lax.map(lambda scene: f(*scene), batch)
+    scenes = jax.tree.leaves(batch)[0].shape[0]
+    return jax.vmap(f, spmd_axis_name=batch_axes(scenes))(*batch)
+
+
 def loss(
     trainable: Tree,
     frozen: Tree,
@@ -329,10 +340,11 @@ def loss(
     """
     params = attach(frozen, trainable)
     scenes = batch["K"].shape[0]
-    terms = jax.vmap(
+    terms = over_scenes(
         lambda views, key: scene_loss(params, views, key, config=config, draws=draws, remat=remat),
-        spmd_axis_name=batch_axes(scenes),
-    )(batch, jax.random.split(key, scenes))
+        batch,
+        jax.random.split(key, scenes),
+    )
     terms = {name: value.mean() for name, value in terms.items()}
     return terms["flow"] + config.flow.photometric * terms["photometric"], terms
 

@@ -11,7 +11,7 @@ from parity import key_listing, load_case, rel_l2, rule_weights
 from roge_jax.config import VAEConfig
 from roge_jax.core.params import abstract, check, count, flatten, unflatten
 from roge_jax.errors import UserError
-from roge_jax.video import vae
+from roge_jax.video import vae, vae_training
 from roge_jax.weights import mapping, wan_vae
 
 SMALL = VAEConfig(base=4)
@@ -248,7 +248,7 @@ def test_stacked_entries_hold_one_layer_per_row():
 # ---------------------------------------------------------------------------------------------------------- training
 @pytest.fixture(scope="module")
 def passthrough():
-    return vae.passthrough_init(jax.random.key(5), SMALL)
+    return vae_training.passthrough_init(jax.random.key(5), SMALL)
 
 
 def test_passthrough_codes_a_video_as_its_images(small, passthrough):
@@ -263,7 +263,7 @@ def test_passthrough_codes_a_video_as_its_images(small, passthrough):
 
 
 def test_passthrough_resamples_by_average_and_repetition():
-    params = vae.passthrough_init(jax.random.key(6), SMALL, noise=0.0)
+    params = vae_training.passthrough_init(jax.random.key(6), SMALL, noise=0.0)
     x = jax.random.normal(jax.random.key(7), (1, 4, 6, 4))
     halved, _ = vae.down(params["encoder"]["stage0"]["down"], x, None)
     average = x.reshape(1, 2, 2, 3, 2, 4).mean((2, 4))
@@ -278,7 +278,9 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     key = jax.random.key(8)
     loss = jax.jit(
         jax.value_and_grad(
-            functools.partial(vae.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, colour=(1.0, 3.0, 5.0)),
+            functools.partial(
+                vae_training.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, colour=(1.0, 3.0, 5.0)
+            ),
             has_aux=True,
         )
     )

@@ -19,7 +19,7 @@ from ..core.lora import attach
 from ..core.params import Tree
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
-from ..video import vae
+from ..video import vae, vae_training
 from .optim import OptimConfig
 
 
@@ -44,7 +44,7 @@ def vae_objective(trainable, frozen, batch, key, *, config, stage):
     p = attach(frozen, trainable)["vae"]
     keys = jax.random.split(key, batch["target_rgb"].shape[0])
     losses, terms = jax.vmap(
-        lambda clip, key: vae.vae_loss(p, 2.0 * clip - 1.0, key, cfg=config.vae)
+        lambda clip, key: vae_training.vae_loss(p, 2.0 * clip - 1.0, key, cfg=config.vae)
     )(batch["target_rgb"], keys)
     return losses.mean(), {name: value.mean() for name, value in terms.items()}
 
@@ -61,7 +61,7 @@ def recon_objective(trainable, frozen, batch, key, *, config, stage):
         truth = model.resized(views["target_rgb"], config.recon_height, config.recon_width)
         return jnp.square(model.decode_rgb(params, features, config=config) - truth).mean()
 
-    mse = jax.vmap(scene)(batch).mean()
+    mse = model.over_scenes(scene, batch).mean()
     return mse, {"psnr": -10 * jnp.log10(mse)}
 
 
@@ -84,7 +84,7 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
             jax.random.split(key, stage.draws),
         ).mean()
 
-    loss = jax.vmap(scene)(batch, jax.random.split(key, batch["K"].shape[0])).mean()
+    loss = model.over_scenes(scene, batch, jax.random.split(key, batch["K"].shape[0])).mean()
     return loss, {"flow": loss}
 
 

@@ -22,7 +22,7 @@ from ..config import RoGeConfig, VAEConfig, to_dict
 from ..core.params import Spec, flatten, init, unflatten
 from ..errors import UserError
 from ..video.dit import FLOAT32_LEAVES
-from ..video.vae import passthrough_init
+from ..video.vae_training import passthrough_init
 from .mapping import Entry, source_shapes
 from .shards import SHARD_BYTES, Layout, Shards, plan_shards
 from .sources import DTYPES, Source
