@@ -46,6 +46,7 @@ class RendererConfig:
     refinement: Literal["per_view", "shared"] = "per_view"  # whose scene tokens the rays refine
     relative_cameras: bool = False
     chunk: int = 8  # views processed at a time
+    merge: Literal[1, 2, 4] = 1  # scene tokens of a photo averaged into one: 2 in a row, 2 x 2
 
 
 @dataclass(frozen=True)

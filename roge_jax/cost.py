@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from . import model
 from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
 from .core.params import flatten
+from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
 from .video.dit import FLOAT32_LEAVES
 
@@ -80,6 +81,21 @@ def renderer(
     chunks = -(-views // cfg.chunk)
     total = views * reading + chunks * keys
     return total + m * per_view if shared else total
+
+
+def scene_tokens_read(config: RoGeConfig, m: int) -> int:
+    """Scene tokens of m photos that the rays attend to, after `RendererConfig.merge`."""
+    grid = encoder_grid(config.encoder, config.recon_height, config.recon_width)
+    rows, columns = (-(-side // cell) for side, cell in zip(grid, MERGES[config.renderer.merge]))
+    return m * rows * columns
+
+
+def preview(config: RoGeConfig, m: int) -> float:
+    """A window that is not generated: photos to scene tokens, the targets' rays, the RGB head."""
+    size, tokens = (config.recon_height, config.recon_width), scene_tokens_read(config, m)
+    views = config.frames + (m if config.renderer.refinement == "shared" else 0)
+    rays = renderer(config.renderer, *size, tokens, m, views)
+    return encoder(config.encoder, *size, m, config.renderer.width) + rays
 
 
 # ---- generation ----------------------------------------------------------------------------------
@@ -263,8 +279,8 @@ def estimate(
     n, slots = config.frames, config.slots(m)
     size = (config.recon_height, config.recon_width)
     rows, columns = encoder_grid(config.encoder, *size)
-    scene_tokens = m * rows * columns
-    seen = scene_tokens + m * (SPECIALS + config.encoder.registers)
+    seen = m * (rows * columns + SPECIALS + config.encoder.registers)
+    scene_tokens = scene_tokens_read(config, m)
     rays = (size[0] // config.renderer.patch) * (size[1] // config.renderer.patch)
     tokens = tokens_per_slot(config) * slots
     flops = {

@@ -129,6 +129,7 @@ def query_rays(
     rays: Relative | None = None
     cameras: Relative | None = None
     m = scene_tokens.shape[0]
+    encoded = vggt.encoder_grid(config.encoder, *size)
     if cfg.relative_cameras:
         head_dim = cfg.width // cfg.heads
         grid = (size[0] // cfg.patch, size[1] // cfg.patch)
@@ -138,10 +139,12 @@ def query_rays(
             seen_K[:m],
             seen_c2w[:m],
             size,
-            grid=vggt.encoder_grid(config.encoder, *size),
+            grid=encoded,
             specials=0,
             head_dim=head_dim,
         )
+    if cfg.merge > 1:
+        scene_tokens, cameras = ray_scene.merge_scene(scene_tokens, cameras, encoded, cfg.merge)
     return ray_scene.query_rays(
         params["renderer"],
         scene_tokens,

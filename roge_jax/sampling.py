@@ -16,7 +16,7 @@ import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -28,13 +28,14 @@ from .core.params import Tree
 from .data.scene import Scene, distinct_views
 from .data.scene import prepare as prepare_photos
 from .errors import UserError, did_you_mean
-from .geometry.cameras import Cameras, Normalisation, camera_vector, concatenate, normalise, to_host
-from .geometry.packing import pad_path
+from .geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
 from .video import flow, solvers, vae
+from .windows import CHAIN_FRAMES, chain_views, chained, view_distance, window_views, windows
+
+__all__ = ["CHAIN_FRAMES", "chain_views", "chained", "view_distance", "window_views", "windows"]
 
 # The defaults of `python -m roge_jax.sample`: good and fast for the shipped model.
 SOLVER, STEPS, SCHEDULE = "unipc_2", 12, "shift"
-CHAIN_FRAMES = 2  # frames already made that join as contexts, where the model takes that many
 LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
@@ -62,6 +63,24 @@ class Settings:
             if word not in allowed:
                 raise UserError(f"Unknown {name} '{word}': {did_you_mean(word, allowed)}")
         flow.schedule(self.schedule, self.steps, solver=self.solver)
+
+
+@dataclasses.dataclass(frozen=True)
+class Choices:
+    """How much of the full model a run uses; `planning.plan` makes them."""
+
+    photos: tuple[int, ...]  # positions among the photos given; the first one is the world frame
+    steps: int
+    solver: str
+    schedule: str
+    recon: tuple[int, int]  # height, width at which the reconstruction sees photos and rays
+    merge: Literal[1, 2, 4]  # `RendererConfig.merge`
+    generate: tuple[bool, ...]  # per window; without it the frames are the RGB head's
+
+
+class Planned(Protocol):
+    @property
+    def choices(self) -> Choices: ...
 
 
 class Photos(NamedTuple):
@@ -108,76 +127,34 @@ def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
     return Photos(images[kept], recon, cameras[kept], tuple(ids))
 
 
-# ---- windows -------------------------------------------------------------------------------------
-
-
-def windows(frames: int, window: int) -> list[tuple[int, int]]:
-    """[start, stop) of every window of a path."""
-    return [(start, min(start + window, frames)) for start in range(0, frames, window)]
-
-
-def chained(m: int, config: RoGeConfig) -> tuple[int, int]:
-    """(photos, generated frames) that later windows see, of `m` photos: together at most `config.max_context`."""
-    made = min(CHAIN_FRAMES, max(1, config.max_context - m), config.frames, config.max_context - 1)
-    return min(m, config.max_context - made), made
-
-
-def view_distance(a: Cameras, b: Cameras) -> np.ndarray:
-    """[a, b]: how far apart views are, in normalised units of travel plus radians of turning."""
-    a, b = to_host(a), to_host(b)
-    travel = np.linalg.norm(a.centres[:, None] - b.centres[None], axis=-1)
-    cosine = (np.einsum("aij,bij->ab", a.c2w[:, :3, :3], b.c2w[:, :3, :3]) - 1.0) / 2.0
-    return travel + np.arccos(np.clip(cosine, -1.0, 1.0))
-
-
-def chain_views(
-    photos: Cameras, made: Cameras, ahead: Cameras, config: RoGeConfig
-) -> tuple[list[int], list[int]]:
-    """Which photos and which frames already made a later window sees (counts as in `chained`).
-
-    The first photo stays: it is the world frame. Other photos stay if they are close to the window `ahead`. The last
-    frame made is always in; the others are chosen one by one to bring the views ahead closest to what is seen.
-    """
-    keep, add = chained(len(photos), config)
-    closeness = view_distance(photos, ahead).min(1)
-    closeness[0] = -1.0
-    kept = sorted(np.argsort(closeness, kind="stable")[:keep].tolist())
-    gaps = view_distance(made, ahead)
-    seen = view_distance(photos[kept], ahead).min(0)
-    chosen: list[int] = []
-    for _ in range(add):
-        gain = np.minimum(gaps, seen[None]).mean(1)
-        gain[chosen] = np.inf
-        best = int(np.argmin(gain)) if chosen else len(made) - 1
-        chosen.append(best)
-        seen = np.minimum(seen, gaps[best])
-    return kept, chosen
-
-
-def window_views(
-    images: np.ndarray,
-    recon: np.ndarray | None,
-    contexts: Cameras,
-    targets: Cameras,
-    info: Normalisation,
-    config: RoGeConfig,
-) -> model.Views:
-    """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window."""
-    targets = pad_path(targets, config.frames)
-    cameras = concatenate(contexts, targets)
-    vectors = camera_vector(
-        contexts, config.height, config.width, info.camera_scale, info.points_flag
-    )
-    views = {
-        "context_rgb": images.astype(np.float32),
-        "K": cameras.K.astype(np.float32),
-        "c2w": cameras.c2w.astype(np.float32),
-        "vectors": np.asarray(vectors, np.float32),
-    }
-    return views if recon is None else views | {"context_recon": recon.astype(np.float32)}
-
-
 # ---- compiled pieces -----------------------------------------------------------------------------
+
+
+def reduced(
+    photos: Photos, config: RoGeConfig, settings: Settings, choices: Choices
+) -> tuple[Photos, RoGeConfig, Settings]:
+    """What `sample` runs with under `choices`; equal to what it was given if they are the full model's."""
+    if len(choices.photos) < len(photos.ids):
+        kept = list(choices.photos)
+        recon = None if photos.recon is None else photos.recon[kept]
+        ids = tuple(photos.ids[i] for i in kept)
+        photos = Photos(photos.images[kept], recon, photos.cameras[kept], ids)
+    size = (config.recon_height, config.recon_width)
+    if choices.recon != size:
+        recon = photos.images if photos.recon is None else photos.recon
+        photos = photos._replace(
+            recon=np.asarray(model.resized(jnp.asarray(recon), *choices.recon))
+        )
+    config = dataclasses.replace(
+        config,
+        recon_height=choices.recon[0],
+        recon_width=choices.recon[1],
+        renderer=dataclasses.replace(config.renderer, merge=choices.merge),
+    )
+    settings = dataclasses.replace(
+        settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
+    )
+    return photos, config, settings
 
 
 class Programs(NamedTuple):
@@ -255,6 +232,31 @@ def programs(
     return Programs(**{name: work.result() for name, work in compiled.items()})
 
 
+class PreviewProgram(NamedTuple):
+    """What runs in a window that is not generated."""
+
+    preview: Callable  # (params, views) -> [n, recon_h, recon_w, 3]
+
+
+def rgb_head(params: Tree, views: model.Views, *, config: RoGeConfig) -> jax.Array:
+    """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3]; the photos' rays are not queried."""
+    tokens, m = model.reconstruct(params, views, config=config), views["context_rgb"].shape[0]
+    if config.renderer.refinement == "shared":  # its refinement reads the rays of the photos
+        features = model.query_rays(params, tokens, views, config=config)[m:]
+    else:
+        targets = views | {"K": views["K"][m:], "c2w": views["c2w"][m:]}
+        features = model.query_rays(params, tokens, targets, config=config, context=views)
+    return model.decode_rgb(params, features, config=config)
+
+
+def preview_program(
+    params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots
+) -> PreviewProgram:
+    """`programs` for a window that is not generated."""
+    piece = jax.jit(functools.partial(rgb_head, config=config))
+    return PreviewProgram(piece.lower(params, views).compile())
+
+
 # ---- sampling ------------------------------------------------------------------------------------
 
 
@@ -266,19 +268,24 @@ def sample(
     settings: Settings = Settings(),
     *,
     stage: Stage | None = None,
+    plan: Planned | None = None,
     progress: bool = False,
-    cache: dict[int, Programs] | None = None,
+    cache: dict[Any, Any] | None = None,
 ) -> Result:
     """The video along `path` (cameras [n] in the scene's frame, K in pixels of config.height x config.width).
 
     Args:
       stage: called with "compile", "prepare", "sample" and "decode"; a context manager that times (`entry.Clock`).
+      plan: what to leave out (`planning.plan`); its steps, solver and schedule replace those of `settings`.
       progress: show a bar over all evaluations of the velocity.
       cache: a dict that keeps the compiled programs for further calls with these parameters, config and slots.
     Raises: UserError for what cannot be done; `solvers.SamplingError` at the first number that is not finite.
     """
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
+    given, unplanned = len(photos.ids), config
+    if plan is not None:
+        photos, config, settings = reduced(photos, config, settings, plan.choices)
     context, target, info = normalise(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale
     )
@@ -286,7 +293,9 @@ def sample(
         settings.schedule, settings.steps, shift=config.flow.shift, solver=settings.solver
     )
     runs = windows(len(path), config.frames)
-    bar = _bar(progress, settings, grid, len(runs))
+    generate = [True] * len(runs) if plan is None else list(plan.choices.generate)
+    assert len(generate) == len(runs), "the plan is for a path of another length"
+    bar = _bar(progress, settings, grid, sum(generate))
     frames: list[np.ndarray] = []
     previews: list[np.ndarray] = []
     told: list[dict[str, Any]] = []
@@ -306,23 +315,15 @@ def sample(
                 else np.concatenate([recon[kept], _enlarged(made[chosen], recon)])
             )
         views = window_views(images, recon, contexts, target[start:stop], info, config)
-        m = len(contexts)
-        if m not in cache:
+        m, n = len(contexts), stop - start
+        usual = generate[number] and config == unplanned
+        key = m if usual else (m, generate[number], config)
+        if key not in cache:
             bar.set_description("compiling")
             with stage("compile"):
-                cache[m] = programs(params, views, config, settings.slots)
-        run = cache[m]
-        bar.set_description("sampling")
-        with stage("prepare"):
-            prepared = jax.block_until_ready(run.prepare(params, views))
-            noise = jnp.asarray(draw_noise(settings.seed, number, m, config))
-        with stage("sample"):
-            x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
-        with stage("decode"):
-            n = stop - start
-            frames.append(np.asarray(run.decode(params, x0))[:n])
-            previews.append(np.asarray(run.preview(params, prepared.features))[:n])
-        evaluations += count
+                make = programs if generate[number] else preview_program
+                cache[key] = make(params, views, config, settings.slots)
+        run = cache[key]
         told.append(
             {
                 "frames": [start, stop - 1],
@@ -330,6 +331,27 @@ def sample(
                 "generated": chosen,
             }
         )
+        if not generate[number]:
+            with stage("preview"):
+                preview = np.asarray(run.preview(params, views))[:n]
+            previews.append(preview)
+            frames.append(_enlarged(preview, photos.images))
+            told[-1]["rgb_head"] = True
+            continue
+        bar.set_description("sampling")
+        # With fewer photos than given, the targets keep the noise that they have with all of them.
+        full = sum(chained(given, config)) if number and settings.long == "chain" else given
+        with stage("prepare"):
+            prepared = jax.block_until_ready(run.prepare(params, views))
+            noise = jnp.asarray(
+                draw_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :]
+            )
+        with stage("sample"):
+            x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
+        with stage("decode"):
+            frames.append(np.asarray(run.decode(params, x0))[:n])
+            previews.append(np.asarray(run.preview(params, prepared.features))[:n])
+        evaluations += count
     bar.close()
     return Result(
         np.concatenate(frames),

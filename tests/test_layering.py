@@ -29,7 +29,9 @@ ALLOWED = {
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},
     "training": _PARTS | {"model", "weights", "data", "metrics", "checkpoint"},
-    "sampling": _PARTS | {"model", "data", "cost"},
+    "windows": _PARTS | {"model"},
+    "sampling": _PARTS | {"model", "data", "cost", "windows"},
+    "planning": _PARTS | {"model", "data", "cost", "windows", "sampling"},
 }
 # Programs and their helpers may import anything but other programs.
 PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "view", "check"}

@@ -152,6 +152,36 @@ def _scene_reads(p, zn, xn, heads, rays, cameras):
     return jax.vmap(one)(zn, xn, rays.project, rays.unproject)
 
 
+# Fewer scene tokens.
+
+MERGES = {1: (1, 1), 2: (1, 2), 4: (2, 2)}  # `RendererConfig.merge`: rows, columns of a cell
+
+
+def merge_scene(
+    tokens: jax.Array, cameras: Relative | None, grid: tuple[int, int], merge: int
+) -> tuple[jax.Array, Relative | None]:
+    """Scene tokens [m, l, d] of a row-major `grid` per photo, averaged over cells of neighbours; cells at an odd
+    border are smaller. Angles are linear in the position, so a cell's mean is the angle of its middle.
+    """
+    cell = (*MERGES[merge], 1)
+
+    def sums(x):  # [l, c]
+        x = jax.lax.reduce_window(
+            x.reshape(*grid, x.shape[-1]), 0.0, jax.lax.add, cell, cell, "SAME"
+        )
+        return x.reshape(-1, x.shape[-1])
+
+    def means(x):
+        return sums(x) / sums(jnp.ones((x.shape[0], 1)))
+
+    tokens = jax.vmap(means)(tokens)
+    if cameras is None:
+        return tokens, None
+    angles = cameras.angles
+    middles = means(angles.reshape(len(angles), -1)).reshape(-1, *angles.shape[1:])
+    return tokens, cameras._replace(angles=middles)
+
+
 # The whole ray query.
 
 

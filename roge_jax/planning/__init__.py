@@ -1,0 +1,1 @@
+"""No more model than a scene needs: what a run may leave out for a tolerance. docs/planning.md explains it."""
