@@ -393,3 +393,13 @@ def test_the_published_sizes_trace_from_photos_to_velocity(name):
     assert prepared.features.shape == (84, 36, 63, 768)
     assert prepared.condition.appearance.shape == (24, 24, 42, 20)
     assert prepared.condition.tokens.shape == (24 * 12 * 21, cfg.dit.width)
+
+
+def test_scenes_one_by_one_equal_all_at_once():
+    def scene(views, key):
+        return {"sum": (views["a"] @ views["a"].T).sum() + jax.random.normal(key)}
+
+    batch = {"a": jax.random.normal(jax.random.key(0), (3, 4, 5))}
+    keys = jax.random.split(jax.random.key(1), 3)
+    together = jax.vmap(scene)(batch, keys)["sum"]
+    np.testing.assert_allclose(model.over_scenes(scene, batch, keys)["sum"], together, rtol=1e-6)
