@@ -122,7 +122,7 @@ class Evaluator:
 
         import jax
 
-        from . import model
+        from . import model, sampling
         from .checkpoint import load_model
         from .video import flow, solvers, vae
 
@@ -134,8 +134,7 @@ class Evaluator:
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
         self.rgb = jax.jit(functools.partial(model.decode_rgb, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
-        self.key = jax.random.key(seed)
-        self.noise = functools.partial(model.draw_noise, config=config)
+        self.noise = functools.partial(sampling.draw_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
 
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -155,7 +154,7 @@ class Evaluator:
         views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
         truth = views.pop("target_rgb")
         prepared = self.prepare(self.params, views)
-        latents, info = self.generate(self.params, prepared, self.noise(self.key, m))
+        latents, info = self.generate(self.params, prepared, self.noise(m))
         self.raise_if_failed(info)
         h, w = truth.shape[1:3]
         head = np.asarray(self.rgb(self.params, prepared.features[m:]))
