@@ -97,6 +97,7 @@ def resized(images: jax.Array, height: int, width: int) -> jax.Array:
     return jax.image.resize(images, (images.shape[0], height, width, 3), "bilinear", antialias=True)
 
 
+@jax.named_scope("reconstruct")
 def reconstruct(params: Tree, views: Views, *, config: RoGeConfig) -> jax.Array:
     """The implicit scene: tokens Z [m, l, d] of the context photos."""
     size = (config.recon_height, config.recon_width)
@@ -110,6 +111,7 @@ def reconstruct(params: Tree, views: Views, *, config: RoGeConfig) -> jax.Array:
     )
 
 
+@jax.named_scope("rays")
 def query_rays(
     params: Tree,
     scene_tokens: jax.Array,
@@ -156,6 +158,7 @@ def query_rays(
     )
 
 
+@jax.named_scope("picture")
 def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """The reconstruction's own picture [v, recon_height, recon_width, 3] of ray features."""
     return ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=config.renderer)
@@ -164,21 +167,25 @@ def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.
 # Generation (Sec. 3.2).
 
 
+@jax.named_scope("vae")
 def encode_contexts(params: Tree, context_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """X^S [m, lh, lw, 16]: every photo encoded alone, as a video of one frame."""
     return vae.encode_frames(params["vae"], 2.0 * context_rgb - 1.0, cfg=config.vae)
 
 
+@jax.named_scope("vae")
 def encode_targets(params: Tree, target_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """X^T [1 + (n - 1) / 4, lh, lw, 16]: the target video through the causal VAE."""
     return vae.encode(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
 
 
+@jax.named_scope("vae")
 def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """Target latents [t, lh, lw, 16] -> video [n, h, w, 3] in [0, 1]."""
     return jnp.clip(0.5 + 0.5 * vae.decode(params["vae"], latents, cfg=config.vae), 0.0, 1.0)
 
 
+@jax.named_scope("condition")
 def condition(
     params: Tree,
     context_latents: jax.Array,
@@ -201,6 +208,7 @@ def unconditioned(context_latents: jax.Array, slots: int, *, config: RoGeConfig)
     return Condition(known, jnp.zeros((tokens, config.dit.width)))
 
 
+@jax.named_scope("transformer")
 def velocity(
     params: Tree,
     x: jax.Array,
@@ -234,6 +242,7 @@ def velocity(
     )
 
 
+@jax.named_scope("transformer")
 def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
     """Cross-attention keys and values of the prompt, the same at every sampling step; None without text."""
     if not config.dit.text_len:
@@ -269,11 +278,15 @@ def flow_matching(
     config: RoGeConfig,
     contexts: int,
     remat: dit.Remat = "full",
+    part: tuple[jax.Array | int, int] | None = None,
 ) -> jax.Array:
-    """w(sigma) |M_t (V - (noise - x0))|^2, the mean over target latents, at one random noise level."""
+    """w(sigma) |M_t (V - (noise - x0))|^2, the mean over target latents, at one random noise level.
+
+    `part`: which part of the noise levels, see `flow.training_sigma`.
+    """
     key_sigma, key_noise = jax.random.split(key)
     cfg = config.flow
-    sigma = flow.training_sigma(key_sigma, method=cfg.sigma_sampling, shift=cfg.shift)
+    sigma = flow.training_sigma(key_sigma, method=cfg.sigma_sampling, shift=cfg.shift, part=part)
     noise = jax.random.normal(key_noise, x0.shape)
     x = flow.x_sigma(x0, noise, sigma)
     v = velocity(params, x, sigma, cond, config=config, contexts=contexts, remat=remat)
@@ -281,6 +294,20 @@ def flow_matching(
     return (
         flow.loss_weight(sigma, weighting=cfg.weighting, shift=cfg.shift) * jnp.square(error).mean()
     )
+
+
+def mean_flow_matching(
+    params: Tree, x0: jax.Array, cond: Condition, key: jax.Array, *, draws: int, **options
+) -> jax.Array:
+    """The mean of `flow_matching` over `draws` noise levels, one from each of as many equally likely parts."""
+    if draws == 1:
+        return flow_matching(params, x0, cond, jax.random.split(key, 1)[0], **options)
+
+    def draw(key_and_part):
+        key, part = key_and_part
+        return flow_matching(params, x0, cond, key, part=(part, draws), **options)
+
+    return jax.lax.map(draw, (jax.random.split(key, draws), jnp.arange(draws))).mean()
 
 
 def scene_loss(
@@ -305,12 +332,10 @@ def scene_loss(
         ]
     )
     cond = condition(params, x0[:m], features, views, config=config)
-
-    def draw(key):
-        return flow_matching(params, x0, cond, key, config=config, contexts=m, remat=remat)
-
     return {
-        "flow": jax.lax.map(draw, jax.random.split(key, draws)).mean(),
+        "flow": mean_flow_matching(
+            params, x0, cond, key, draws=draws, config=config, contexts=m, remat=remat
+        ),
         "photometric": photometric(params, features, views, config=config),
     }
 

@@ -1,5 +1,7 @@
 """The path, training noise levels and sampling grids, against the published tables."""
 
+import functools
+import itertools
 import json
 from pathlib import Path
 
@@ -95,6 +97,19 @@ def test_training_sigmas_follow_their_distribution():
     assert abs(logits.mean()) < 4 / np.sqrt(20000) and abs(logits.std() - 1) < 4 / np.sqrt(40000)
 
 
+@pytest.mark.parametrize("method", ["uniform_index", "logit_normal"])
+def test_stratified_sigmas_take_one_from_each_part_and_keep_the_distribution(method):
+    draw = functools.partial(flow.training_sigma, method=method)
+    parts = [np.asarray(draw(jax.random.key(j), (2000,), part=(j, 4))) for j in range(4)]
+    for lower, upper in itertools.pairwise(parts):
+        assert lower.max() <= upper.min()
+    free = np.sort(draw(jax.random.key(9), (8000,)))
+    together = np.sort(np.concatenate(parts))
+    both = np.concatenate([free, together])
+    gap = np.searchsorted(free, both, "right") - np.searchsorted(together, both, "right")
+    assert np.abs(gap).max() / 8000 < 1.95 * np.sqrt(2 / 8000)  # Kolmogorov-Smirnov, 0.1 %
+
+
 @settings(max_examples=60, deadline=None)
 @given(
     name=st.sampled_from(["shift", "unipc", "dpmpp", "uniform", "graded"]),
@@ -121,7 +136,7 @@ def test_graded_grid_walks_to_sigma_min_and_jumps():
         (("shfit", 10), "did you mean 'shift'"),
         (("shift", 0), "whole number >= 1"),
         (("shift", 2.5), "whole number >= 1"),
-        (("optimised", 7), "No optimised schedule for solver 'euler' with 7 steps"),
+        (("optimised", 7), "give model="),
     ],
 )
 def test_wrong_requests_are_named(arguments, words, tmp_path, monkeypatch):
@@ -132,57 +147,3 @@ def test_wrong_requests_are_named(arguments, words, tmp_path, monkeypatch):
         flow.schedule("uniform", 2, breaks=(0.3, 0.6))
     with pytest.raises(UserError, match="Unknown loss weighting"):
         flow.training_table(weighting="bmup")
-
-
-def test_optimised_schedules_are_read_per_solver_and_step_count(tmp_path, monkeypatch):
-    path = tmp_path / "schedules.json"
-    path.write_text(json.dumps({"grids": {"heun": {"3": [1.0, 0.6, 0.2, 0.0]}}}))
-    monkeypatch.setattr(flow, "OPTIMISED_FILE", path)
-    np.testing.assert_array_equal(flow.schedule("optimised", 3, solver="heun"), [1, 0.6, 0.2, 0])
-    with pytest.raises(UserError, match="heun: 3"):
-        flow.schedule("optimised", 4, solver="heun")
-
-
-def test_dynamic_programming_finds_the_cheapest_grid():
-    # exhaustive search over all grids of a small teacher is the oracle
-    import itertools
-
-    rng = np.random.default_rng(0)
-    sigmas = np.linspace(1, 0, 9)
-    errors = rng.uniform(0.1, 1, size=(9, 9)) * (sigmas[:, None] - sigmas[None]) ** 2
-    for steps in (1, 3, 5):
-        paths = [(0, *mid, 8) for mid in itertools.combinations(range(1, 8), steps - 1)]
-        costs = [sum(errors[a, b] for a, b in itertools.pairwise(p)) for p in paths]
-        best = sigmas[list(paths[int(np.argmin(costs))])]
-        np.testing.assert_array_equal(flow.optimise_schedule(sigmas, errors, steps), best)
-    with pytest.raises(UserError, match=r"allowed 1\.\.8"):
-        flow.optimise_schedule(sigmas, errors, 9)
-
-
-def test_optimised_grid_beats_uniform_and_shift_on_the_flow_it_was_made_for():
-    from roge_jax.video.solvers import solve, tabulate
-    from roge_jax.video.testbed import random_mixture
-
-    problem = random_mixture(8, 4, 0.1)
-    train, held_out = jax.random.normal(jax.random.key(0), (2, 64, 8))
-    fine = flow.schedule("uniform", 64)
-    run = jax.jit(lambda x, table: solve(table, problem.velocity, x)[0])
-    _, info = jax.jit(lambda x: solve("midpoint", problem.velocity, x, fine, keep_states=True))(
-        train
-    )
-    slopes = jax.vmap(problem.velocity)(info.states[:-1], jnp.asarray(fine[:-1], jnp.float32))
-    errors = flow.euler_jump_errors(fine, info.states, np.append(slopes, slopes[-1:], axis=0))
-    end = {"train": info.states[-1], "held out": run(held_out, tabulate("midpoint", fine))}
-
-    def error(grid, x=train, of="train"):
-        # median over samples: single samples flip to another mode on any coarse grid
-        gap = run(x, tabulate("euler", grid)) - end[of]
-        return float(jnp.median(jnp.linalg.norm(gap, axis=-1)))
-
-    by_jumps = flow.optimise_schedule(fine, errors, 8)
-    refined = flow.refine_schedule(error, by_jumps, rounds=2, trials=4)
-    assert error(refined) <= error(by_jumps)
-    found = {
-        name: error(flow.schedule(name, 8), held_out, "held out") for name in ("uniform", "shift")
-    }
-    assert error(refined, held_out, "held out") < 0.8 * min(found.values())

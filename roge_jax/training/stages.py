@@ -77,12 +77,8 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
         ]
         x0 = jax.lax.stop_gradient(jnp.concatenate(latents))
         cond = model.unconditioned(x0[:m], x0.shape[0], config=config)
-        return jax.lax.map(
-            lambda key: model.flow_matching(
-                params, x0, cond, key, config=config, contexts=m, remat=stage.remat
-            ),
-            jax.random.split(key, stage.draws),
-        ).mean()
+        options = {"config": config, "contexts": m, "remat": stage.remat}
+        return model.mean_flow_matching(params, x0, cond, key, draws=stage.draws, **options)
 
     loss = model.over_scenes(scene, batch, jax.random.split(key, batch["K"].shape[0])).mean()
     return loss, {"flow": loss}

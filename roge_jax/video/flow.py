@@ -107,14 +107,24 @@ def training_sigma(
     shift: float = 5.0,
     mean: float = 0.0,
     std: float = 1.0,
+    part: tuple[Array | int, int] | None = None,
 ) -> Array:
     """Random noise levels, float32 `shape`: one for each sample, shared by all of its slots.
+
+    `part` = (j, k): from the j-th (from 0) of k equally likely parts of the distribution; one draw from each is a
+    stratified sample, whose mean loss varies less than that of k free draws.
 
     "uniform_index": a point of the training grid, each equally likely. "logit_normal":
     shifted(sigmoid(mean + std n)), the practice of large pre-training runs.
     """
     _known(method, SIGMA_SAMPLERS, "sigma sampler")
-    if method == "uniform_index":
+    if part is not None:
+        quantile = (part[0] + jax.random.uniform(key, shape)) / part[1]
+        if method == "uniform_index":
+            u = (jnp.floor(quantile * TRAIN_POINTS) + 1.0).clip(1, TRAIN_POINTS) / TRAIN_POINTS
+        else:
+            u = jax.nn.sigmoid(mean + std * jax.scipy.special.ndtri(quantile))
+    elif method == "uniform_index":
         u = jax.random.randint(key, shape, 1, TRAIN_POINTS + 1) / TRAIN_POINTS
     else:
         u = jax.nn.sigmoid(mean + std * jax.random.normal(key, shape))
@@ -144,6 +154,7 @@ def schedule(
     sigma_min: float = 0.0,
     breaks: Sequence[float] = (),
     solver: str = "euler",
+    model: str | None = None,
 ) -> np.ndarray:
     """A descending grid of noise levels, float64 [steps + 1], last one 0.
 
@@ -152,7 +163,8 @@ def schedule(
     "dpmpp"      Wan's grid for DPM-Solver++; the same points as "shift"
     "uniform"    linspace(1, 0); `shift` does not apply
     "graded"     u^power, finer towards 0; with `sigma_min` it walks to there and jumps to 0
-    "optimised"  found offline for `solver` (`optimise_schedule`), read from schedules.json
+    "optimised"  found offline for `solver` on the weights of `model` (a config's name), read from
+                 schedules.json; experiments/optimise_schedules.py finds them
 
     `breaks`: noise levels that must be grid points, such as the ends of a guidance interval; the
     pieces between them are stretched, the number of steps stays.
@@ -174,7 +186,7 @@ def schedule(
     elif name == "graded":
         sigmas = _graded(steps, power, sigma_min)
     else:
-        sigmas = _optimised(steps, solver)
+        sigmas = _optimised(steps, solver, model)
     sigmas[-1] = 0.0
     return with_breaks(sigmas, breaks)
 
@@ -192,18 +204,27 @@ def _graded(steps: int, power: float, sigma_min: float) -> np.ndarray:
     return np.append((low + (1 - low) * np.linspace(1.0, 0.0, steps)) ** power, 0.0)
 
 
-def _optimised(steps: int, solver: str) -> np.ndarray:
+def optimised_grids(model: str) -> dict[str, dict[int, list[float]]]:
+    """The stored grids of a model, {solver: {steps: sigmas [steps + 1]}}; empty if there are none."""
     table = json.loads(OPTIMISED_FILE.read_text()) if OPTIMISED_FILE.exists() else {}
-    stored = table.get("grids", {}).get(solver, {})
-    if str(steps) not in stored:
-        have = ", ".join(
-            f"{name}: {'/'.join(grids)}" for name, grids in table.get("grids", {}).items()
-        )
+    grids = table.get(model, {}).get("grids", {})
+    return {solver: {int(n): g for n, g in some.items()} for solver, some in grids.items()}
+
+
+def _optimised(steps: int, solver: str, model: str | None) -> np.ndarray:
+    if model is None:
         raise UserError(
-            f"No optimised schedule for solver '{solver}' with {steps} steps is stored; there is "
-            f"{have or 'none at all'}. Use another schedule, or make one with optimise_schedule."
+            "An optimised schedule belongs to a model: give model=, the name of its config."
         )
-    return np.asarray(stored[str(steps)], np.float64)
+    stored = optimised_grids(model)
+    if steps not in stored.get(solver, {}):
+        have = "; ".join(f"{name} {'/'.join(map(str, g))}" for name, g in stored.items())
+        raise UserError(
+            f"No optimised schedule of model '{model}' for solver '{solver}' with {steps} steps is stored; "
+            f"there is {have or 'none for this model'}. Use another schedule, or find one with "
+            "experiments/optimise_schedules.py."
+        )
+    return np.asarray(stored[solver][steps], np.float64)
 
 
 def with_breaks(sigmas: np.ndarray, breaks: Sequence[float]) -> np.ndarray:
@@ -254,12 +275,39 @@ def euler_jump_errors(sigmas: np.ndarray, states: np.ndarray, velocities: np.nda
     return errors
 
 
+def adams_jump_errors(sigmas: np.ndarray, states: np.ndarray, velocities: np.ndarray) -> np.ndarray:
+    """As `euler_jump_errors` for a second-order step that remembers the slope of the point before.
+
+    Returns [k, k, k]: entry (p, i, j), p < i < j, is the mean squared error of the two-step
+    Adams-Bashforth jump from i to j with the teacher's slopes at p and i; entry (0, 0, j) is the
+    Euler start; other entries are infinite.
+    """
+    s = np.asarray(sigmas, np.float64)
+    count = len(s)
+    x = np.asarray(states, np.float64).reshape(count, -1)
+    v = np.asarray(velocities, np.float64).reshape(count, -1)
+    errors = np.full((count, count, count), np.inf)
+    errors[0, 0] = euler_jump_errors(s, x, v)[0]
+    # |x_j - x_i - h v_i - q (v_i - v_p)|^2 from scalar products: vectors are long, triples are many
+    vv = v @ v.T
+    for i in range(1, count - 1):
+        h = s[i + 1 :] - s[i]  # [j]
+        rest = x[i + 1 :] - x[i][None] - h[:, None] * v[i][None]
+        bends = v[i][None] - v[:i]  # [p, :]
+        q = 0.5 * h[None] ** 2 / (s[i] - s[:i])[:, None]  # [p, j]
+        square = np.sum(rest**2, axis=1)[None] - 2 * q * (bends @ rest.T)
+        square += q**2 * (vv[i, i] - 2 * vv[i, :i] + np.diag(vv)[:i])[:, None]
+        errors[:i, i, i + 1 :] = np.maximum(square, 0.0) / x.shape[1]
+    return errors
+
+
 def optimise_schedule(sigmas: np.ndarray, errors: np.ndarray, steps: int) -> np.ndarray:
     """The `steps`-step grid through the teacher's points with the least total jump error.
 
-    `sigmas` [k] is the teacher's fine grid, `errors` [k, k] the cost of jumping from point i to a
-    later point j (`euler_jump_errors`, or measured for any one-step solver). Exact shortest path
-    with a fixed number of edges, by dynamic programming, O(steps k^2). Returns float64 [steps + 1].
+    `sigmas` [k] is the teacher's fine grid. `errors` is the cost of jumping from point i to a later
+    point j: [k, k] (`euler_jump_errors`), or [k, k, k] where the point p before i matters too
+    (`adams_jump_errors`). Exact shortest path with a fixed number of edges, by dynamic programming,
+    O(steps k^2) or O(steps k^3). Returns float64 [steps + 1].
     """
     sigmas = np.asarray(sigmas, np.float64)
     count = len(sigmas)
@@ -267,46 +315,60 @@ def optimise_schedule(sigmas: np.ndarray, errors: np.ndarray, steps: int) -> np.
         raise UserError(
             f"{steps} steps cannot be chosen from a teacher with {count - 1}; allowed 1..{count - 1}."
         )
-    allowed = np.where(np.arange(count)[:, None] < np.arange(count)[None], errors, np.inf)
-    cost = np.full(count, np.inf)
-    cost[0] = 0.0
+    order = np.arange(count)
+    allowed = np.where(order[:, None] < order[None], errors, np.inf)  # [i, j] or [p, i, j]
+    if allowed.ndim == 2:
+        allowed = np.broadcast_to(allowed[None], (count, count, count))
+    cost = np.full((count, count), np.inf)  # [p, i]
+    cost[0, 0] = 0.0
     previous = []
     for _ in range(steps):
-        total = cost[:, None] + allowed
-        previous.append(total.argmin(0))
+        total = cost[:, :, None] + allowed
+        previous.append(total.argmin(0))  # [i, j] -> p
         cost = total.min(0)
-    if not np.isfinite(cost[-1]):
+    end = count - 1
+    if not np.isfinite(cost[:, end]).any():
         raise UserError(
             "The teacher trajectory holds non-finite errors; no schedule can be chosen."
         )
-    path = [count - 1]
+    path = [end, int(cost[:, end].argmin())]
     for row in reversed(previous):
-        path.append(int(row[path[-1]]))
-    return sigmas[path[::-1]]
+        path.append(int(row[path[-1], path[-2]]))
+    return sigmas[path[-2::-1]]  # the last entry is the point "before" the start
 
 
 def refine_schedule(
-    error: Callable[[np.ndarray], float], grid: np.ndarray, *, rounds: int = 3, trials: int = 5
+    error: Callable[[np.ndarray], float], grid: np.ndarray, *, rounds: int = 2, reach: float = 0.4
 ) -> np.ndarray:
     """Move the inner points of `grid` one by one to where `error(grid)` is least.
 
     `error` runs the sampler itself and returns its end error to a teacher, so this sees what the
     sum of jump errors cannot: how the rest of the path shrinks or grows an early error, and the
-    memory of multistep solvers. `trials` places per point and round, between its neighbours, the
-    search narrowing each round. The result is never worse than `grid` under `error`.
+    memory of multistep solvers. A point is tried `reach` of the way to either neighbour and at the
+    vertex of the parabola through the three errors; the reach halves each round. Two or three calls
+    per point and round. The result is never worse than `grid` under `error`.
     """
     grid, best = np.array(grid, np.float64), float(error(grid))
+
+    def attempt(i: int, sigma: float) -> float:
+        nonlocal grid, best
+        trial = grid.copy()
+        trial[i] = sigma
+        value = float(error(trial))
+        if value < best:
+            grid, best = trial, value
+        return value
+
     for k in range(rounds):
-        reach = 0.8 * 0.5**k
         for i in range(1, len(grid) - 1):
-            here = grid[i]
-            up, down = grid[i - 1] - here, grid[i + 1] - here
-            for t in np.linspace(-reach, reach, trials):
-                trial = grid.copy()
-                trial[i] = here + (t * up if t > 0 else -t * down)
-                value = float(error(trial)) if t else best
-                if value < best:
-                    grid, best = trial, value
+            here, middle = grid[i], best
+            shifts = reach * 0.5**k * np.array([grid[i - 1] - here, grid[i + 1] - here])
+            slopes = [(attempt(i, here + shift) - middle) / shift for shift in shifts]
+            curve = (slopes[0] - slopes[1]) / (shifts[0] - shifts[1])
+            if curve > 0:  # not for NaN: a grid that fails
+                vertex = -0.5 * (slopes[0] - curve * shifts[0]) / curve
+                if shifts[1] < vertex < shifts[0]:
+                    attempt(i, here + vertex)
     return grid
 
 
