@@ -141,7 +141,7 @@ def small():
 
 def test_new_weights_give_zero_velocity_and_follow_the_official_init():
     cfg = dataclasses.replace(SMALL, width=192, depth=2)
-    p = jax.jit(lambda key: params.init(key, net.dit_specs(cfg)))(jax.random.key(0))
+    p = params.init(jax.random.key(0), net.dit_specs(cfg))
     x, text, clip = inputs(cfg)
     assert not np.any(run(p, x, 400.0, angles_for(cfg), text, clip, cfg))
     q = np.asarray(p["blocks"]["self_attn"]["q"]["kernel"])
@@ -186,7 +186,7 @@ def test_rope_angles_by_hand():
 def test_zero_lora_changes_no_bit_and_merging_equals_the_branch(small):
     p, x, text, clip, base = small
     specs = lora.lora_specs(net.dit_specs(SMALL), 2, r"blocks/.*(attn|ffn)/|patch_embed$")
-    factors = jax.jit(lambda key: params.init(key, specs))(jax.random.key(5))
+    factors = params.init(jax.random.key(5), specs)
     args = (x, 400.0, angles_for(SMALL), text, clip, SMALL)
     np.testing.assert_array_equal(run(lora.attach(p, factors), *args), base)
     factors = jax.tree.map(
@@ -253,7 +253,7 @@ def test_recomputation_policies_give_one_gradient():
     reference = gradient("none")
     assert all(np.any(leaf) for leaf in reference.values())
     whole = np.sqrt(sum(np.sum(leaf**2) for leaf in reference.values()))
-    for remat in ("full", "dots"):
+    for remat in ("full", "attention", "dots"):
         for path, leaf in gradient(remat).items():
             # Key biases nearly cancel in the softmax: what is left of them is rounding at the scale of the whole.
             scale = max(np.linalg.norm(reference[path]), 1e-2 * whole)

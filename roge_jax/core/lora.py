@@ -9,14 +9,11 @@ import re
 import jax.numpy as jnp
 import numpy as np
 
-from .params import Spec, Tree, flatten, unflatten, zeros
+from .params import Spec, Tree, flatten, unflatten, uniform, zeros
 
 
-def _kaiming_uniform(key, shape, dtype):
-    import jax
-
-    bound = 1.0 / np.sqrt(shape[-2])
-    return jax.random.uniform(key, shape, dtype, -bound, bound)
+def _kaiming_uniform(rng, shape, dtype):
+    return uniform(1.0 / np.sqrt(shape[-2]))(rng, shape, dtype)
 
 
 def lora_specs(specs, rank: int, match: str) -> Tree:

@@ -15,32 +15,41 @@ import numpy as np
 from ..errors import UserError
 
 Tree = dict[str, Any]
-Initialiser = Callable[[jax.Array, tuple[int, ...], Any], jax.Array]
+# NumPy draws initial values: eager JAX would compile a program for every shape, seconds for a tiny model.
+Initialiser = Callable[[np.random.Generator, tuple[int, ...], Any], np.ndarray]
 
 
 def fan_in(scale: float = 1.0) -> Initialiser:
     """Normal with standard deviation scale / sqrt(product of all axes but the last)."""
 
-    def init(key, shape, dtype):
-        return scale * jax.random.normal(key, shape, dtype) / np.sqrt(np.prod(shape[:-1]))
+    return lambda rng, shape, dtype: normal(scale / np.sqrt(np.prod(shape[:-1])))(rng, shape, dtype)
+
+
+def normal(std: float) -> Initialiser:
+    return lambda rng, shape, dtype: (
+        np.float32(std) * rng.standard_normal(shape, np.float32)
+    ).astype(dtype)
+
+
+def uniform(bound: float) -> Initialiser:
+    """Uniform between -bound and bound."""
+
+    def init(rng, shape, dtype):
+        return (np.float32(bound) * (2 * rng.random(shape, np.float32) - 1)).astype(dtype)
 
     return init
 
 
-def normal(std: float) -> Initialiser:
-    return lambda key, shape, dtype: std * jax.random.normal(key, shape, dtype)
-
-
 def constant(value: float) -> Initialiser:
-    return lambda key, shape, dtype: jnp.full(shape, value, dtype)
+    return lambda rng, shape, dtype: np.full(shape, value, dtype)
 
 
-def zeros(key, shape, dtype):
-    return jnp.zeros(shape, dtype)
+def zeros(rng, shape, dtype):
+    return np.zeros(shape, dtype)
 
 
-def ones(key, shape, dtype):
-    return jnp.ones(shape, dtype)
+def ones(rng, shape, dtype):
+    return np.ones(shape, dtype)
 
 
 class Spec(NamedTuple):
@@ -82,10 +91,12 @@ def unflatten(flat: Mapping[str, Any]) -> Tree:
 
 
 def init(key: jax.Array, specs) -> Tree:
-    """Initial values. A leaf's key depends on its path alone, so adding a leaf changes no other."""
+    """Initial values (not under jit). A leaf's seed is `key` and its path, so adding a leaf changes no other."""
+    seed = np.asarray(jax.random.key_data(key)).tolist()
 
     def leaf(path: str, spec: Spec):
-        return spec.init(jax.random.fold_in(key, zlib.crc32(path.encode())), spec.shape, spec.dtype)
+        rng = np.random.default_rng([*seed, zlib.crc32(path.encode())])
+        return jnp.asarray(spec.init(rng, spec.shape, spec.dtype))
 
     return unflatten({path: leaf(path, spec) for path, spec in flatten(specs).items()})
 
@@ -104,8 +115,8 @@ def stack(specs, n: int):
     """Specs of `n` equal blocks, stacked along a new leading axis for `lax.scan`."""
 
     def leaf(s: Spec) -> Spec:
-        def stacked(key, shape, dtype):
-            return jax.vmap(lambda k: s.init(k, s.shape, dtype))(jax.random.split(key, n))
+        def stacked(rng, shape, dtype):
+            return np.stack([s.init(rng, s.shape, dtype) for _ in range(n)])
 
         return Spec((n, *s.shape), ("layers", *s.axes), stacked, s.dtype)
 

@@ -6,14 +6,14 @@ in that of the query kernel. The depth is stacked leaves under `blocks`, walked 
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..config import DiTConfig
-from ..core.attention import attention, merge_heads, split_heads
+from ..core.attention import attention, is_attention, merge_heads, split_heads
 from ..core.layers import (
     gelu,
     layer_norm,
@@ -27,12 +27,12 @@ from ..core.layers import (
     rms_norm,
     unpatchify,
 )  # fmt: skip
-from ..core.params import Initialiser, Spec, Tree, normal, stack, zeros
+from ..core.params import Spec, Tree, normal, stack, uniform, zeros
 from ..core.rope import frequencies, rotate_pairs
 from ..core.sharding import by_heads, constrain
 
 Split = Literal["image_first", "text_last"]
-Remat = Literal["none", "full", "dots"]
+Remat = Literal["none", "dots", "attention", "full"]
 
 EPS = 1e-6  # every norm of the blocks and of the head
 CLIP_EPS = 1e-5  # the two norms of the CLIP embedding
@@ -41,13 +41,8 @@ CLIP_EPS = 1e-5  # the two norms of the CLIP embedding
 FLOAT32_LEAVES = r"(^|/)(modulation|scale)$|norm\w*/bias$|^time_embed/|^head/"
 
 
-def _uniform(bound: float) -> Initialiser:
-    return lambda key, shape, dtype: jax.random.uniform(key, shape, dtype, -bound, bound)
-
-
-def _xavier(key, shape, dtype):
-    bound = np.sqrt(6.0 / (np.prod(shape[:-1]) + shape[-1]))
-    return jax.random.uniform(key, shape, dtype, -bound, bound)
+def _xavier(rng, shape, dtype):
+    return uniform(np.sqrt(6.0 / (np.prod(shape[:-1]) + shape[-1])))(rng, shape, dtype)
 
 
 def dit_specs(cfg: DiTConfig) -> Tree:
@@ -57,7 +52,7 @@ def dit_specs(cfg: DiTConfig) -> Tree:
     embed = patch_conv_specs(cfg.patch, cfg.in_channels, d, init=_xavier)
     bound = (cfg.patch**2 * cfg.in_channels) ** -0.5
     specs: Tree = {
-        "patch_embed": embed | {"bias": embed["bias"]._replace(init=_uniform(bound))},
+        "patch_embed": embed | {"bias": embed["bias"]._replace(init=uniform(bound))},
         "time_embed": {
             "fc1": linear_specs(cfg.freq_dim, d, (None, "embed"), init=normal(0.02)),
             "fc2": linear_specs(d, d, ("embed", "mlp"), init=normal(0.02)),
@@ -243,13 +238,19 @@ def block(
     return x + y * lift(gate_f, x.ndim)
 
 
+POLICIES: dict[Remat, Any] = {
+    "full": None,
+    "attention": is_attention,
+    "dots": jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+}
+
+
 def rematerialise(f, remat: Remat):
-    """`f` as a scan body whose backward pass recomputes everything (full), all but matrix products (dots) or nothing."""
-    assert remat in ("none", "full", "dots"), remat
+    """`f` as a scan body whose backward pass recomputes everything (full), all but what attention returns
+    (attention), all but products with weights (dots), or nothing (none)."""
     if remat == "none":
         return f
-    policy = jax.checkpoint_policies.dots_with_no_batch_dims_saveable if remat == "dots" else None
-    return jax.checkpoint(f, policy=policy, prevent_cse=False)
+    return jax.checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
 
 
 def dit_blocks(

@@ -27,7 +27,7 @@ def passthrough_init(key: jax.Array, cfg: VAEConfig, *, noise: float = 0.1) -> T
             kernel = rng.standard_normal(spec.shape) / np.sqrt(np.prod(spec.shape[:-1]))
             tree[path] = jnp.asarray(_passthrough(module, kernel, noise), spec.dtype)
         else:
-            tree[path] = spec.init(key, spec.shape, spec.dtype)  # zeros and ones
+            tree[path] = jnp.asarray(spec.init(rng, spec.shape, spec.dtype))  # zeros and ones
     return unflatten(tree)
 
 
