@@ -8,6 +8,10 @@ class UserError(ValueError):
     """A mistake in the input. Entry points print its one sentence and exit with code 2."""
 
 
+class LimitWarning(UserWarning):
+    """Photos or a path lie beyond what the model was measured to stand (`limits`); the result may be poor."""
+
+
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """A sentence fragment listing `options`, led by the closest one to `word` if any is close."""
     options = sorted(options)

@@ -70,6 +70,12 @@ def parser() -> argparse.ArgumentParser:
     option("--context-slots", slots_help, "noised", type=one_of(SLOTS))
     long_help = "long paths: chain (later windows see frames already made) or independent"
     option("--long", long_help, "chain", type=one_of(LONG))
+    tolerance_help = (
+        "spend no more than this needs: expected RMS colour difference (0 to 1) to the full model's frames, e.g. 0.02; "
+        "chooses among the photos, steps and more (docs/planning.md)"
+    )
+    option("--tolerance", tolerance_help, type=number(0, whole=False))
+    option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)
     option("--fps", "frames per second", 16.0, type=number(1e-3, whole=False))
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     p.add_argument(
@@ -275,6 +281,7 @@ def record(
         "size": list(result.frames.shape[1:3]),
         "evaluations": result.evaluations,
         "windows": list(result.windows),
+        "warnings": [one._asdict() for one in result.warnings],
         "stages": clock.record(),
         "config": to_dict(config),
     }
@@ -315,12 +322,30 @@ def main(args: argparse.Namespace) -> None:
         print(
             f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
         )
-        result = sampling.sample(params, config, photos, path, settings, stage=clock, progress=True)
+        plan = None
+        if args.tolerance is not None or args.max_cost is not None:
+            from .planning.plan import plan as make_plan
+
+            with clock("plan"):
+                plan = make_plan(
+                    params,
+                    config,
+                    photos,
+                    path,
+                    tolerance=args.tolerance or 0.0,
+                    max_cost=args.max_cost,
+                    settings=settings,
+                )
+            print(plan.explain())
+        result = sampling.sample(
+            params, config, photos, path, settings, plan=plan, stage=clock, progress=True
+        )
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
         with clock("write"):
             write_outputs(folder, result, photos, args.fps)
         content = record(args, config, settings, scene, photos, result, clock)
+        content |= {} if plan is None else {"plan": dataclasses.asdict(plan)}
         write_json(folder / "run.json", content)
     stages = ", ".join(
         f"{name} {stage['seconds']:.1f} s" for name, stage in content["stages"].items()

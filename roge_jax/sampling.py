@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import cost, model
+from . import cost, limits, model
 from .config import RoGeConfig
 from .core.params import Tree
 from .data.scene import Scene, distinct_views
@@ -62,7 +62,8 @@ class Settings:
         ):
             if word not in allowed:
                 raise UserError(f"Unknown {name} '{word}': {did_you_mean(word, allowed)}")
-        flow.schedule(self.schedule, self.steps, solver=self.solver)
+        if self.schedule != "optimised":  # those belong to a model, which `sample` knows
+            flow.schedule(self.schedule, self.steps, solver=self.solver)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +105,7 @@ class Result:
     windows: tuple[
         dict[str, Any], ...
     ]  # {"frames": [first, last], "photos": [...], "generated": [...]}
+    warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
 def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
@@ -238,9 +240,12 @@ class PreviewProgram(NamedTuple):
     preview: Callable  # (params, views) -> [n, recon_h, recon_w, 3]
 
 
-def rgb_head(params: Tree, views: model.Views, *, config: RoGeConfig) -> jax.Array:
+def rgb_head(
+    params: Tree, views: model.Views, *, config: RoGeConfig, scene_tokens: jax.Array | None = None
+) -> jax.Array:
     """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3]; the photos' rays are not queried."""
-    tokens, m = model.reconstruct(params, views, config=config), views["context_rgb"].shape[0]
+    tokens, m = scene_tokens, views["context_rgb"].shape[0]
+    tokens = model.reconstruct(params, views, config=config) if tokens is None else tokens
     if config.renderer.refinement == "shared":  # its refinement reads the rays of the photos
         features = model.query_rays(params, tokens, views, config=config)[m:]
     else:
@@ -289,8 +294,13 @@ def sample(
     context, target, info = normalise(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale
     )
+    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
     grid = flow.schedule(
-        settings.schedule, settings.steps, shift=config.flow.shift, solver=settings.solver
+        settings.schedule,
+        settings.steps,
+        shift=config.flow.shift,
+        solver=settings.solver,
+        model=config.name,
     )
     runs = windows(len(path), config.frames)
     generate = [True] * len(runs) if plan is None else list(plan.choices.generate)
@@ -360,6 +370,7 @@ def sample(
         info,
         evaluations,
         tuple(told),
+        warned,
     )
 
 

@@ -28,9 +28,10 @@ ALLOWED = {
     "metrics": _BASE,
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},
-    "training": _PARTS | {"model", "weights", "data", "metrics", "checkpoint"},
+    "limits": _BASE,
+    "training": _PARTS | {"model", "weights", "data", "metrics", "checkpoint", "cost"},
     "windows": _PARTS | {"model"},
-    "sampling": _PARTS | {"model", "data", "cost", "windows"},
+    "sampling": _PARTS | {"model", "data", "cost", "windows", "limits"},
     "planning": _PARTS | {"model", "data", "cost", "windows", "sampling"},
 }
 # Programs and their helpers may import anything but other programs.

@@ -1,0 +1,257 @@
+"""Where the curves of `robustness.py` break, what follows for the limits of the package, tables and pictures.
+
+No program of its own: `python experiments/robustness.py --draw` makes all of it again from the stored numbers.
+"""
+
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from roge_jax import limits
+from roge_jax.metrics import report
+
+METRICS = ("psnr", "ssim", "sharpness_ratio")
+MODELS, METHODS = ("rgb_head", "generated"), ("rgb_head", "generated", "nearest", "plane")
+LOSS = 1.0  # dB
+RESAMPLES = 2000
+REACHES = (0.5, 1.0, 1.5, 2.0, 2.5)  # baselines
+
+
+class Knob(NamedTuple):
+    title: str
+    unit: str
+    levels: tuple[float, ...]  # outwards, without the undisturbed one
+    still: float = 0.0  # the undisturbed level
+    log: bool = False
+
+
+KNOBS = {
+    "rotation": Knob("pose: rotation", "RMS error of the photos, degrees", (0.5, 1, 2, 4, 8)),
+    "position": Knob("pose: position", "RMS error, fraction of the baseline", (0.02, 0.05, 0.1, 0.2, 0.4)),
+    "focal": Knob("focal length", "error of the photos, %, either sign", (2.5, 5, 10, 20, 40)),
+    "noise": Knob("photo noise", "standard deviation (white = 1)", (0.02, 0.05, 0.1, 0.2)),
+    "blur": Knob("photo blur", "Gaussian sigma, pixels of 112", (0.5, 1, 2, 4)),
+    "jpeg": Knob("JPEG", "quality", (50, 20, 10, 5), 100, True),
+    "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.5, 1, 2, 3)),
+    "photos": Knob("fewer photos", "photos, all distinct", (2, 1), 3),
+    "more": Knob("more photos", "photos, all distinct", (4, 6), 3),
+    "copies": Knob("repeated photos", "distinct photos of 3", (2, 1), 3),
+    "padding": Knob("repeated photos", "photos, of which 3 distinct", (6,), 3),
+    "crowding": Knob("crowded photos", "spacing of the photos, 1 = even", (0.6, 0.4, 0.2), 1.0),
+    "extrapolation": Knob("extrapolation", "targets outside the photos' hull, baselines", REACHES),
+    "wider": Knob("wider targets", "field of view over the photos' (tangents)", (1.2, 1.5, 2, 3), 1.0, True),
+    "narrower": Knob("narrower targets", "field of view over the photos'", (0.8, 0.6, 0.4, 0.25), 1.0, True),
+}  # fmt: skip
+
+# The run-time measure (of `roge_jax.limits`) that shows a knob, where one does.
+SHOWN = {
+    "extrapolation": "extrapolation", "wider": "field_ratio", "narrower": "field_ratio",
+    "photos": "distinct_photos", "exposure": "exposure_stops", "blur": "sharpness",
+}  # fmt: skip
+
+
+# ---- where it breaks -----------------------------------------------------------------------------
+
+
+def crossing(levels: np.ndarray, values: np.ndarray, log: bool = False) -> float:
+    """The first level at which a piecewise linear curve falls below 0, NaN if never; `values` [levels]."""
+    x = np.log(levels) if log else np.asarray(levels, float)
+    below = np.flatnonzero(values < 0)
+    if not len(below):
+        return math.nan
+    i = int(below[0])
+    if i == 0:
+        return float(levels[0])
+    share = values[i - 1] / (values[i - 1] - values[i])
+    at = x[i - 1] + share * (x[i] - x[i - 1])
+    return float(np.exp(at) if log else at)
+
+
+def with_interval(levels, per_scene: np.ndarray, log: bool) -> dict[str, Any]:
+    """`crossing` of the mean over scenes of `per_scene` [levels, scenes], and its 95 % bootstrap interval.
+
+    None means beyond the last level; a resample that does not cross counts as infinitely far.
+    """
+    draws = np.random.default_rng(0).integers(
+        0, per_scene.shape[1], (RESAMPLES, per_scene.shape[1])
+    )
+    mean = np.nanmean(per_scene, 1)
+    sampled = np.nanmean(per_scene[:, draws], 2)  # [levels, resamples]
+    found = np.array([crossing(levels, column, log) for column in sampled.T])
+    outwards = 1.0 if levels[-1] > levels[0] else -1.0
+    ordered = np.sort(np.where(np.isnan(found), np.inf, outwards * found))
+    low, high = (ordered[int(q * (RESAMPLES - 1))] for q in (0.025, 0.975))
+    ends = [outwards * x if np.isfinite(x) else None for x in (low, high)]
+    at = crossing(levels, mean, log)
+    return {
+        "at": None if math.isnan(at) else at,
+        "interval": ends,
+        "share_crossing": float(np.isfinite(ordered).mean()),
+    }
+
+
+def breaks(found: dict[str, dict]) -> dict[str, dict[str, Any]]:
+    """{knob: {method: {"loses_1_db": .., "below_nearest": ..}}}."""
+    result: dict[str, dict] = {}
+    for knob, data in found.items():
+        levels, log = np.array(data["levels"]), KNOBS[knob].log
+        psnr = {m: np.array(data["scores"][m]["psnr"]) for m in METHODS}
+        result[knob] = {}
+        for method in ("rgb_head", "generated", "plane"):
+            own = psnr[method]
+            result[knob][method] = {
+                "loses_1_db": with_interval(levels, own - own[:1] + LOSS, log),
+                "below_nearest": with_interval(levels, own - psnr["nearest"], log),
+            }
+    return result
+
+
+def limit_rows(found: dict, broken: dict) -> dict[str, dict[str, Any]]:
+    """The rows of `limits.json`: the earlier 1 dB break of the two outputs in units of the run-time measure."""
+    rows = {}
+    for knob, measured in SHOWN.items():
+        levels, log = np.array(found[knob]["levels"]), KNOBS[knob].log
+        outwards = 1.0 if levels[-1] > levels[0] else -1.0
+        ends = {m: broken[knob][m]["loses_1_db"] for m in MODELS}
+        real = {m: end["at"] for m, end in ends.items() if end["at"] is not None}
+        first = min(real, key=lambda m: outwards * real[m]) if real else None
+        at = real[first] if first else float(levels[-1])
+        per_scene = np.array(found[knob]["seen"][measured])
+        x = np.log(levels) if log else levels
+        values = np.median(per_scene, 1)
+        order = np.argsort(x)
+        limit = float(np.interp(np.log(at) if log else at, x[order], values[order]))
+        sign = 1.0 if values[-1] > values[0] else -1.0  # warn above or below
+        rows[knob] = {
+            "limit": limit,
+            "broke": first is not None,
+            "measure": measured,
+            "knob": at,
+            "interval": ends[first]["interval"] if first else [None, None],
+            "output": first,
+            "undisturbed_beyond": float((sign * per_scene[0] > sign * limit).mean()),
+            "last_level_beyond": float((sign * per_scene[-1] >= sign * limit).mean()),
+        }
+    return rows
+
+
+# ---- pictures ------------------------------------------------------------------------------------
+
+COLOURS = {"rgb_head": "#1f77b4", "generated": "#d62728", "nearest": "#7f7f7f", "plane": "#2ca02c"}
+LABELS = {"rgb_head": "RGB head", "generated": "generated video", "nearest": "nearest photo", "plane": "plane"}  # fmt: skip
+AXES = {"psnr": "PSNR, dB", "ssim": "SSIM", "sharpness_ratio": "sharpness (1 = truth)"}
+PANELS = (
+    ("rotation",), ("position",), ("focal",), ("noise",), ("blur",), ("jpeg",), ("exposure",),
+    ("photos", "more"), ("copies",), ("crowding",), ("extrapolation",), ("narrower", "wider"),
+)  # fmt: skip
+
+
+def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> None:
+    """One panel a knob: mean over scenes, band of the paired change, breaks as dotted lines."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    fig, axes = plt.subplots(3, 4, figsize=(16, 10.2), sharey=True)
+    for ax, knobs in zip(axes.flat, PANELS, strict=True):
+        knob = KNOBS[knobs[-1]]
+        for method in METHODS:
+            levels, mean, low, high = joined(found, knobs, method, metric)
+            colour = COLOURS[method]
+            style = "-" if method in MODELS else "--"
+            ax.plot(levels, mean, style, color=colour, marker="o", ms=3.5, label=LABELS[method])
+            ax.fill_between(levels, low, high, color=colour, alpha=0.15, lw=0)
+        for knob_name in knobs:
+            for method in MODELS if metric == "psnr" else ():
+                at = broken[knob_name][method]["loses_1_db"]["at"]
+                if at is not None:
+                    ax.axvline(at, color=COLOURS[method], ls=":", lw=1.5)
+        one_side = found[knobs[0]]["levels"]
+        two = len(knobs) > 1
+        title = "photos" if knobs == ("photos", "more") else knob.title
+        title = "field of view of the targets" if knobs == ("narrower", "wider") else title
+        ax.set(title=title, xlabel=knob.unit)
+        if knob.log:
+            ticks = sorted({x for k in knobs for x in found[k]["levels"]})
+            ax.set_xscale("log")
+            ax.set_xticks(ticks, [f"{x:g}" for x in ticks])
+            ax.minorticks_off()
+        elif knob.unit.startswith(("photos", "distinct")):
+            ax.set_xticks(sorted({x for k in knobs for x in found[k]["levels"]}))
+        if one_side[-1] < one_side[0] and not two:
+            ax.invert_xaxis()
+        ax.grid(True, alpha=0.25)
+    for ax in axes[:, 0]:
+        ax.set_ylabel(AXES[metric])
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    if metric == "psnr":
+        handles.append(plt.Line2D([], [], color="k", ls=":"))
+        labels.append("has lost 1 dB (by colour)")
+    fig.legend(handles, labels, loc="lower center", ncol=6, frameon=False)
+    fig.suptitle(
+        f"{AXES[metric].split(',')[0]} under one disturbance at a time: mean over {scenes} held-out scenes, band: "
+        "95 % bootstrap of the change from undisturbed"
+    )
+    fig.tight_layout(rect=(0, 0.035, 1, 1))
+    fig.savefig(path, dpi=80)
+    plt.close(fig)
+
+
+def joined(found: dict, knobs: tuple[str, ...], method: str, metric: str):
+    """(levels, mean, low, high) of one or two knobs that leave the undisturbed point in opposite directions."""
+    points = {}
+    for knob in knobs:
+        values = np.array(found[knob]["scores"][method][metric])
+        for level, row in zip(found[knob]["levels"], values, strict=True):
+            change = row - values[0]
+            change = change[np.isfinite(change)]
+            spread = report.bootstrap(change, resamples=RESAMPLES)
+            points[level] = (values[0].mean(), spread["mean"], spread["low"], spread["high"])
+    levels = sorted(points)
+    base, *rows = np.array([points[x] for x in levels]).T
+    return levels, *(base + row for row in rows)
+
+
+def write_limits(document: dict) -> None:
+    """The entry of this model in the package's table, with where it comes from."""
+    table = json.loads(limits.TABLE.read_text()) if limits.TABLE.exists() else {}
+    settings = document["settings"]
+    table[settings["model"]] = {
+        "provenance": {
+            "command": " ".join(document["command"]),
+            "commit": document["commit"],
+            "weights": settings["weights"],
+            "seeds": [settings["seeds"][0], settings["seeds"][-1]],
+            "scenes": len(settings["seeds"]),
+            "criterion": f"mean PSNR {settings['loss_db']:g} dB below undisturbed, earlier of {' and '.join(MODELS)}",
+        },
+        "limits": document["limits"],
+    }
+    limits.TABLE.write_text(json.dumps(table, indent=1) + "\n")
+
+
+def summary(document: dict) -> str:
+    """The breaks as a table in markdown."""
+
+    def cell(end: dict) -> str:
+        if end["at"] is None:
+            return f"no ({100 * end['share_crossing']:.0f} %)" if end["share_crossing"] else "no"
+        low, high = ("-" if x is None else f"{x:.3g}" for x in end["interval"])
+        return f"{end['at']:.3g} [{low}, {high}]"
+
+    lines = [
+        "| knob | RGB head loses 1 dB | video loses 1 dB | RGB head below nearest | video below nearest |",
+        "|---|---|---|---|---|",
+    ]
+    for knob, row in document["breaks"].items():
+        cells = [cell(row[m][k]) for k in ("loses_1_db", "below_nearest") for m in MODELS]
+        lines.append(f"| {KNOBS[knob].title}: {KNOBS[knob].unit} | {' | '.join(cells)} |")
+    for kind, row in document["limits"].items():
+        lines.append(
+            f"{kind}: limit {row['limit']:.3g} ({row['measure']}), undisturbed beyond it {row['undisturbed_beyond']:.0%}"
+        )
+    return "\n".join(lines)

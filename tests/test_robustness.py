@@ -1,0 +1,267 @@
+"""Disturbances do what they say, run-time measures see them, and warnings come beyond measured limits and not within."""
+
+import importlib.util
+import json
+import sys
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from camera_cases import looking_at_origin
+from scene_files import nerfstudio, truth
+
+from roge_jax import checkpoint, entry, limits, model, sample, sampling
+from roge_jax.config import preset
+from roge_jax.data import perturb
+from roge_jax.errors import LimitWarning
+from roge_jax.geometry.cameras import Cameras
+
+ROOT = Path(__file__).parents[1]
+
+
+def photos(m=3, height=48, width=64, seed=0):
+    """Textured pictures in [0.2, 0.8]."""
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(0.2, 0.8, (m, height // 4, width // 4, 3))
+    fine = rng.uniform(-0.1, 0.1, (m, height, width, 3))
+    return np.clip(coarse.repeat(4, 1).repeat(4, 2) + fine, 0, 1).astype(np.float32)
+
+
+def at(centres, focal=50.0):
+    """Cameras that look along z from these places."""
+    centres = np.asarray(centres, float)
+    c2w = np.tile(np.eye(4), (len(centres), 1, 1))
+    c2w[:, :3, 3] = centres
+    K = np.array([[focal, 0, 32], [0, focal, 24], [0, 0, 1.0]])
+    return Cameras(np.tile(K, (len(centres), 1, 1)), c2w)
+
+
+# Disturbances.
+
+
+def test_pose_errors_have_the_size_asked_for():
+    cameras, rng = looking_at_origin(2000), np.random.default_rng(0)
+    turned = perturb.turn_cameras(cameras, 3.0, rng)
+    relative = np.swapaxes(cameras.c2w[:, :3, :3], 1, 2) @ turned.c2w[:, :3, :3]
+    angle = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+    assert np.sqrt(np.mean(angle**2)) == pytest.approx(3.0, rel=0.05)  # 2000 draws: 1 % spread
+    np.testing.assert_array_equal(turned.centres, cameras.centres)
+    moved = perturb.move_cameras(cameras, 0.2, rng)
+    gaps = np.linalg.norm(moved.centres - cameras.centres, axis=1)
+    assert np.sqrt(np.mean(gaps**2)) == pytest.approx(0.2, rel=0.05)
+    np.testing.assert_array_equal(moved.c2w[:, :3, :3], cameras.c2w[:, :3, :3])
+
+
+def test_photo_disturbances_have_the_size_asked_for():
+    images, rng = 0.5 * np.ones((2, 64, 64, 3), np.float32), np.random.default_rng(0)
+    assert (perturb.add_noise(images, 0.1, rng) - images).std() == pytest.approx(0.1, rel=0.05)
+    light = perturb.expose(images, np.array([1.0, -1.0])) ** perturb.GAMMA
+    ratio = light[0].mean() / light[1].mean()
+    assert np.log2(ratio) == pytest.approx(2.0, abs=1e-3)
+    point = np.zeros((1, 65, 65, 3), np.float32)
+    point[0, 32, 32] = 1.0
+    spot = perturb.blur(point, 2.0)[0, ..., 0].astype(float)
+    x = np.arange(65) - 32
+    assert np.sqrt((spot * x[None] ** 2).sum() / spot.sum()) == pytest.approx(2.0, rel=0.02)
+    smooth = perturb.blur(photos(), 2.0)  # colours are coded at half resolution
+    errors = [np.abs(perturb.jpeg(smooth, q) - smooth).mean() for q in (95, 50, 10)]
+    assert errors == sorted(errors) and errors[0] < 0.01
+    focal = perturb.scale_focal(at(np.zeros((2, 3))), 1.1).K
+    assert focal[0, 0, 0] == pytest.approx(55) and focal[0, 0, 2] == 32
+
+
+# Measures.
+
+
+def test_distance_from_the_hull_in_baselines():
+    context = at([[0, 0, 0], [2, 0, 0], [0, 1, 0]])  # baseline: the hypotenuse
+    base = np.sqrt(5.0)
+    target = at(
+        [[0.5, 0.25, 0], [1, 0, 0], [2, 0, 0], [0.5, 0.25, 1], [4, 0, 0], [-1, -1, 0], [2, 2, 0]]
+    )
+    to_edge = np.hypot(*(np.array([2, 2]) - (np.array([0, 1]) + np.array([2, -1]) * 3 / 5)))
+    expected = np.array([0, 0, 0, 1, 2, np.sqrt(2), to_edge]) / base
+    np.testing.assert_allclose(limits.extrapolation(context, target), expected, atol=1e-9)
+
+
+def test_distance_from_the_hull_equals_a_linear_programme():
+    """Nine random centres: non-negative least squares with a heavy row for the sum of the shares."""
+    from scipy.optimize import nnls
+
+    rng = np.random.default_rng(0)
+    seen, asked = rng.normal(size=(9, 3)), 0.7 * rng.normal(size=(20, 3))
+    base = np.linalg.norm(seen[:, None] - seen[None], axis=-1).max()
+    matrix = np.concatenate([seen.T, 1e4 * np.ones((1, 9))])
+    expected = []
+    for x in asked:
+        shares, _ = nnls(matrix, np.append(x, 1e4))
+        expected.append(np.linalg.norm(seen.T @ shares - x) / base)
+    found = limits.extrapolation(at(seen), at(asked))
+    assert (found > 0.05).sum() > 3 and (found < 1e-6).sum() >= 3
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_measures_know_no_unit_and_no_place(unit):
+    """Another unit and a far-away origin change nothing; photos in one place have no baseline."""
+    rng = np.random.default_rng(1)
+    seen, asked = rng.normal(size=(4, 3)), 2 * rng.normal(size=(6, 3))
+    here = limits.extrapolation(at(seen), at(asked))
+    there = limits.extrapolation(at(unit * (seen + 50)), at(unit * (asked + 50)))
+    np.testing.assert_allclose(there, here, rtol=1e-6, atol=1e-9)
+    one = np.tile(seen[:1], (3, 1))
+    for few in (one, one[:1]):
+        assert np.isnan(limits.extrapolation(at(few), at(asked))).all()
+        assert len(limits.repeats(at(few))) == len(few) - 1
+
+
+def test_other_measures():
+    context = at(np.zeros((3, 3)) + np.arange(3)[:, None], focal=60.0)
+    np.testing.assert_allclose(limits.field_ratio(context, at(np.zeros((2, 3)), 30.0)), [2, 2])
+    twins = context[np.array([0, 1, 0, 2, 1])]
+    assert limits.repeats(twins) == {2: 0, 4: 1}
+    turned = perturb.turn_cameras(twins, 30.0, np.random.default_rng(0))
+    assert limits.repeats(turned) == {}  # one place, other directions: not the same photo
+    images = photos()
+    assert np.ptp(limits.exposures(images)) < 0.1
+    stops = limits.exposures(perturb.expose(images, np.array([-1.0, 0.0, 0.0])))
+    assert stops[1] - stops[0] == pytest.approx(1.0, abs=0.1)
+    sharp = limits.sharpness(images)
+    for sigma in (1.0, 2.0):
+        softer = limits.sharpness(perturb.blur(images, sigma))
+        assert (softer < 0.8 * sharp).all()
+        sharp = softer
+    assert np.isnan(limits.sharpness(np.full((1, 32, 32, 3), 0.3))).all()
+
+
+# Warnings.
+
+LIMITS = {
+    "extrapolation": {"limit": 1.0, "broke": True},
+    "wider": {"limit": 1.5, "broke": True},
+    "narrower": {"limit": 0.5, "broke": False},
+    "photos": {"limit": 2.4, "broke": True},
+    "exposure": {"limit": 1.5, "broke": True},
+    "blur": {"limit": 0.4, "broke": True},
+}
+SEEN = at([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+
+
+def sharp_photos(m=3):
+    return np.tile(photos(1), (m, 1, 1, 1))
+
+
+CASES = {
+    "extrapolation": (SEEN, at([[1 + x, 0, 0] for x in (0, 1, 2, 3)]), sharp_photos(), "frames 2-3"),
+    "wider": (SEEN, at([[0, 0, 0]] * 3, 30.0), sharp_photos(), "frames 0-2"),
+    "narrower": (SEEN, at([[0, 0, 0]], 120.0), sharp_photos(), "frame 0"),
+    "photos": (SEEN[np.array([0, 1, 0])], at([[0, 0, 0]]), sharp_photos(), "14 repeats 10"),
+    "exposure": (SEEN, at([[0, 0, 0]]), perturb.expose(sharp_photos(), np.array([-2.0, 0, 0])), "brighter than photo 10"),
+    "blur": (SEEN, at([[0, 0, 0]]), np.concatenate([sharp_photos(2), perturb.blur(sharp_photos(1), 3.0)]), "photo 14 is blurred"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", CASES)
+def test_one_warning_beyond_a_limit_and_none_within(kind):
+    context, target, images, said = CASES[kind]
+    found = limits.beyond(images, context, target, LIMITS, ids=(10, 12, 14))
+    assert [one.kind for one in found] == [kind]
+    message = found[0].message
+    assert said in message and ": " in message and message.endswith(".") and "\n" not in message
+    assert f"{LIMITS[kind]['limit']:.2g}" in message or kind == "photos"
+    # The same input is within limits a little beyond it.
+    value = found[0].value
+    looser = 1.01 * value if value > LIMITS[kind]["limit"] else 0.99 * value
+    relaxed = LIMITS | {kind: LIMITS[kind] | {"limit": looser}}
+    assert limits.beyond(images, context, target, relaxed) == []
+    assert limits.beyond(images, context, target, {}) == []  # a model without measured limits
+
+
+def without_network(params, views, config, slots):
+    """Programs that give grey frames: nothing is compiled."""
+    video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
+    return sampling.Programs(
+        prepare=lambda params, views: SimpleNamespace(features=None),
+        velocity=lambda params, prepared, noise, x, sigma: jnp.zeros_like(x),
+        decode=lambda params, x0: video,
+        preview=lambda params, features: video,
+    )
+
+
+def test_the_program_warns_once_and_records_it(tmp_path, monkeypatch, capsys):
+    config = preset("tiny")
+    checkpoint.save_model(tmp_path / "model", model.init(jax.random.key(0), config), config)
+    nerfstudio(tmp_path / "scene", truth(3))
+    monkeypatch.setattr(sampling, "programs", without_network)
+
+    def run(limit):
+        rows = {"extrapolation": {"limit": limit, "broke": True}}
+        monkeypatch.setattr(limits, "table", lambda name: rows if name == "tiny" else {})
+        words = ["--checkpoint", tmp_path / "model", "--scene", tmp_path / "scene", "--steps", 1]
+        words += ["--frames", 7, "--trajectory", "move-right:distance=3", "--out", tmp_path / "out"]
+        assert entry.execute(sample.main, sample.parser(), [str(w) for w in words]) == 0
+        record = json.loads((tmp_path / "out" / "run.json").read_text())["warnings"]
+        said = [x for x in capsys.readouterr().err.splitlines() if "baselines" in x]
+        return record, said
+
+    record, said = run(0.5)
+    assert len(said) == 1 and [w["kind"] for w in record] == ["extrapolation"]
+    assert said[0] == f"warning: {record[0]['message']}"
+    assert record[0]["value"] > record[0]["limit"] == 0.5
+    assert run(1e3) == ([], [])
+
+
+def test_warnings_have_their_own_category():
+    context, target, images, _ = CASES["wider"]
+    with (
+        pytest.warns(LimitWarning, match="1.7 times as wide"),
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr(limits, "table", lambda name: LIMITS)
+        limits.warn(images, context, target, "any", (0, 1, 2))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.simplefilter("ignore", LimitWarning)
+        assert limits.warn(images, context, target, "tiny", (0, 1, 2)) == ()
+
+
+# Where curves break.
+
+
+@pytest.fixture(scope="module")
+def report():
+    folder = ROOT / "experiments"
+    spec = importlib.util.spec_from_file_location(
+        "robustness_report", folder / "robustness_report.py"
+    )
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    yield module
+    del sys.modules[spec.name]
+
+
+def test_crossing_is_interpolated(report):
+    levels = np.array([0.0, 1.0, 2.0])
+    assert report.crossing(levels, np.array([1.0, 0.5, -0.5])) == pytest.approx(1.5)
+    assert np.isnan(report.crossing(levels, np.array([1.0, 0.5, 0.1])))
+    assert report.crossing(levels, np.array([-1.0, 0.5, 0.1])) == 0.0
+    falling = np.array([100.0, 10.0, 1.0])
+    assert report.crossing(falling, np.array([1.0, 1.0, -1.0]), True) == pytest.approx(10**0.5)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_break_of_a_known_curve_and_its_interval(report, direction):
+    """Scenes that lose `slope` dB a level: the mean breaks at 1 / mean slope, the interval holds it."""
+    slopes = np.random.default_rng(0).uniform(0.3, 0.7, 12)
+    steps = np.arange(6.0)
+    found = report.with_interval(direction * steps, 1.0 - steps[:, None] * slopes[None], False)
+    assert direction * found["at"] == pytest.approx(1 / slopes.mean(), rel=1e-6)
+    low, high = sorted(direction * x for x in found["interval"])
+    assert low < 1 / slopes.mean() < high and found["share_crossing"] == 1.0
+    never = report.with_interval(direction * steps, np.ones((6, 12)), False)
+    assert never["at"] is None and never["interval"] == [None, None]
