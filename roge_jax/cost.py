@@ -360,20 +360,20 @@ def report(
     ]
     for name, flops in first.flops.items():
         times = f", each of {evaluations}" if name == "velocity" else ""
-        work = _scaled(first.working_bytes[name], "B")
-        lines.append(f"{name + times:24s}{_scaled(flops, 'FLOP'):>16s}{work:>18s}")
+        work = scaled(first.working_bytes[name], "B")
+        lines.append(f"{name + times:24s}{scaled(flops, 'FLOP'):>16s}{work:>18s}")
     return "\n".join(
         [
             *lines,
-            f"{'all windows':24s}{_scaled(total, 'FLOP'):>16s}",
+            f"{'all windows':24s}{scaled(total, 'FLOP'):>16s}",
             "",
-            f"peak memory about {_scaled(peak, 'B')}: weights and the hungriest stage, beside the "
+            f"peak memory about {scaled(peak, 'B')}: weights and the hungriest stage, beside the "
             "runtime's own 0.3 to 0.6 GB",
         ]
     )
 
 
-def _scaled(value: float, unit: str) -> str:
+def scaled(value: float, unit: str) -> str:
     """1.23e10 FLOP -> "12.3 GFLOP"."""
     for prefix, size in (("P", 1e15), ("T", 1e12), ("G", 1e9), ("M", 1e6)):
         if value >= size:

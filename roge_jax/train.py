@@ -56,7 +56,9 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--batch", type=int, help="scenes per step (default: the stage's own)")
     p.add_argument("--lr", type=float, help="learning rate (default: the stage's own)")
-    p.add_argument("--size", help="HEIGHTxWIDTH of stage hires (default: 1.5 times the model's)")
+    p.add_argument(
+        "--size", help="HEIGHTxWIDTH (default: the model's own; stage hires: 1.5 times that)"
+    )
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
     p.add_argument("--devices", type=int, help="devices to use, on one machine (default: all)")
@@ -71,7 +73,22 @@ def parser() -> argparse.ArgumentParser:
         help="of weights that do not train (default: bfloat16 on accelerators, float32 on a CPU)",
     )
     p.add_argument(
+        "--remat",
+        choices=("none", "dots", "attention", "full"),
+        help="what the backward pass keeps of the transformer: everything, matrix products, what\n"
+        "attention returns, or the input of each block (default: dots; full from 1e9 parameters)",
+    )
+    p.add_argument(
         "--show-mesh", action="store_true", help="print where every leaf lies, then train"
+    )
+    p.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="print tokens, FLOPs and bytes of a step on each device of --mesh, and stop; no weights are\n"
+        "needed; matrices of models above 1e9 parameters count as bfloat16, their attention as fused",
+    )
+    p.add_argument(
+        "--context", type=int, help="photos per scene that --dry-run counts (default: the most)"
     )
     p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
     p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
@@ -112,6 +129,8 @@ class ProceduralSource:
 def main(args: argparse.Namespace) -> None:
     from .core import distributed, sharding
 
+    if args.dry_run:
+        return print(dry_run(args))
     sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
     wanted = args.devices or math.prod(sizes.values())
     if wanted > 1 and not distributed.launch_arguments(os.environ):
@@ -127,10 +146,8 @@ def main(args: argparse.Namespace) -> None:
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
     from . import checkpoint, config
-    from .training import stages as stages_
 
-    preset = config.preset(args.preset)
-    init = args.init or ("mini" if args.preset == "mini" and args.stage != "all" else "scratch")
+    preset, init = config.preset(args.preset), starting_point(args)
     with on_host():
         if init == "scratch":
             from . import model
@@ -138,6 +155,20 @@ def main(args: argparse.Namespace) -> None:
             params, cfg = model.init(jax.random.key(args.seed), preset), preset
         else:
             params, cfg = checkpoint.load_model(init)
+    cfg, chosen = choose(args, cfg)
+    for stage in chosen:
+        params, cfg = run_stage(args, stage, params, cfg, mesh)
+
+
+def starting_point(args: argparse.Namespace) -> str:
+    return args.init or ("mini" if args.preset == "mini" and args.stage != "all" else "scratch")
+
+
+def choose(args: argparse.Namespace, cfg):
+    """(the configuration at --size, the stages that --stage means with everything that the flags change)."""
+    from .training import plan
+    from .training import stages as stages_
+
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames)
     if args.stage == "all":
         chosen = recipe
@@ -145,10 +176,53 @@ def main(args: argparse.Namespace) -> None:
         chosen = [stages_.lora_stage(200, frames=cfg.frames, hires=args.stage == "hires")]
     else:
         chosen = [stages_.find_stage(recipe, args.stage)]
-    if args.stage == "hires":
+    if args.stage == "hires" or args.size:
         cfg = resize(cfg, args.size)
+    changes = {"steps": args.steps, "batch": args.batch}
+    changes = {k: v for k, v in changes.items() if v}
+    changes["remat"] = args.remat or plan.default_remat(cfg)
+    chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
+    if args.lr:
+        chosen = [
+            dataclasses.replace(s, optim=dataclasses.replace(s.optim, learning_rate=args.lr))
+            for s in chosen
+        ]
+    return cfg, chosen
+
+
+def dry_run(args: argparse.Namespace) -> str:
+    """What a step of every chosen stage costs, as text. Devices need not be there, weights are not read."""
+    from . import checkpoint, config, model
+    from .core import sharding
+    from .core.params import count
+    from .errors import UserError
+    from .training import plan
+
+    init = starting_point(args)
+    cfg = config.preset(args.preset)
+    if init != "scratch":
+        cfg = checkpoint.load_config(checkpoint.find_model(init))
+    cfg, chosen = choose(args, cfg)
+    large = count(model.specs(cfg)) > plan.LARGE
+    dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
+    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    if args.devices:
+        sizes.setdefault("data", max(1, args.devices // math.prod(sizes.values())))
+    mesh = sharding.abstract_mesh(**sizes) if sizes else None
+    texts = []
     for stage in chosen:
-        params, cfg = run_stage(args, stage, params, cfg, mesh)
+        m = max(stage.views.contexts) if args.context is None else args.context
+        if not 1 <= m <= cfg.max_context:
+            raise UserError(
+                f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
+            )
+        if mesh is not None:
+            check_batch(stage.batch, mesh)
+        found = plan.plan(
+            cfg, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
+        )
+        texts.append(plan.report(found, cfg, stage, m=m, mesh=mesh, dtype=dtype))
+    return "\n\n".join(texts)
 
 
 def resize(cfg, size: str | None):
@@ -217,6 +291,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
     from .core.lora import attach, merge
     from .core.params import count, flatten, unflatten
     from .core.params import init as init_specs
+    from .cost import keeps_float32
     from .data.pool import read_pool
     from .training import loop, stages
 
@@ -225,12 +300,6 @@ def run_stage(args, stage, params, cfg, mesh=None):
     if args.resume and args.stage == "all" and done.exists():
         print(f"{stage.name}: already trained, {done.parent}")
         return checkpoint.load_model(done.parent)
-    changes = {"steps": args.steps, "batch": args.batch}
-    stage = dataclasses.replace(stage, **{k: v for k, v in changes.items() if v})
-    if args.lr:
-        stage = dataclasses.replace(
-            stage, optim=dataclasses.replace(stage.optim, learning_rate=args.lr)
-        )
     if mesh is not None:
         check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
@@ -240,13 +309,11 @@ def run_stage(args, stage, params, cfg, mesh=None):
     else:
         source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
     trainable, frozen = model.split(params, stage.trains)
-    specs, frozen_specs = model.split(model.specs(cfg), stage.trains)
+    specs, frozen_specs = stages.stage_specs(cfg, stage)
     if stage.lora:
         added = stages.new_leaves(cfg, stage)
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
-        specs = attach(specs, added)
-    if stage.objective in ("vae", "recon"):
-        frozen, frozen_specs = {}, {}
+    frozen = frozen if frozen_specs else {}
     dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
     if dtype != "float32":
         frozen = reduced(frozen, dtype)
@@ -254,9 +321,10 @@ def run_stage(args, stage, params, cfg, mesh=None):
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     say = print if distributed.is_main() else (lambda *_: None)
     if args.show_mesh and mesh is not None:
-        say(
-            f"trains: {sharding.describe(specs, mesh)}\nfrozen: {sharding.describe(frozen_specs, mesh)}"
+        kept = sharding.describe(
+            frozen_specs, mesh, lambda path: "float32" if keeps_float32(path) else dtype
         )
+        say(f"trains: {sharding.describe(specs, mesh)}\nfrozen: {kept}")
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
     say(
         f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "

@@ -13,18 +13,19 @@ XLA inserts the communication. Model code names logical axes only; without a mes
 import contextlib
 import contextvars
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from ..errors import UserError, did_you_mean
 from .params import Tree, flatten, unflatten
 
 MESH_AXES = ("data", "fsdp", "seq")
+AnyMesh = Mesh | AbstractMesh  # shapes and places can be worked out without devices
 
 
 class Rule(NamedTuple):
@@ -83,6 +84,11 @@ def make_mesh(
     )
 
 
+def abstract_mesh(data: int = 1, fsdp: int = 1, seq: int = 1) -> AbstractMesh:
+    """A mesh of devices that need not be there: enough to work out what would lie where."""
+    return AbstractMesh((data, fsdp, seq), MESH_AXES, axis_types=(AxisType.Auto,) * 3)
+
+
 def _fitting(n: int, fsdp: int, seq: int) -> str:
     if n % (fsdp * seq) == 0:
         return f"data={n // (fsdp * seq)}, fsdp={fsdp}, seq={seq} does"
@@ -112,7 +118,7 @@ def parse_mesh(text: str) -> dict[str, int]:
 
 
 def partition(
-    axes: Sequence[str | None], shape: Sequence[int], mesh: Mesh, *, leaf: str = "array"
+    axes: Sequence[str | None], shape: Sequence[int], mesh: AnyMesh, *, leaf: str = "array"
 ) -> PartitionSpec:
     """The `PartitionSpec` of an array with logical `axes`, one entry per dimension.
 
@@ -136,11 +142,11 @@ def partition(
     return PartitionSpec(*entries)
 
 
-def _ways(mesh: Mesh, axes: Sequence[str]) -> int:
+def _ways(mesh: AnyMesh, axes: Sequence[str]) -> int:
     return math.prod(mesh.shape[a] for a in axes)
 
 
-def shardings(specs: Tree, mesh: Mesh) -> Tree:
+def shardings(specs: Tree, mesh: AnyMesh) -> Tree:
     """`NamedSharding` of every leaf of a spec tree. All leaves that do not divide are counted in one UserError."""
     found, faults, sizes = {}, [], []
     for path, spec in flatten(specs).items():
@@ -156,11 +162,11 @@ def shardings(specs: Tree, mesh: Mesh) -> Tree:
     return unflatten(found)
 
 
-def replicated(mesh: Mesh) -> NamedSharding:
+def replicated(mesh: AnyMesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec())
 
 
-def state_shardings(state: Any, specs: Tree, mesh: Mesh) -> Any:
+def state_shardings(state: Any, specs: Tree, mesh: AnyMesh) -> Any:
     """Shardings of a training state: leaves that mirror a parameter (moments, averages) lie where it lies.
 
     A leaf mirrors the parameter whose path is the tail of its own, if the shapes agree; all others are replicated.
@@ -178,7 +184,7 @@ def state_shardings(state: Any, specs: Tree, mesh: Mesh) -> Any:
     return jax.tree_util.tree_map_with_path(leaf, state)
 
 
-def batch_sharding(mesh: Mesh, batch: int) -> NamedSharding:
+def batch_sharding(mesh: AnyMesh, batch: int) -> NamedSharding:
     """Of arrays with a leading axis of `batch` scenes. Raises UserError if `data` does not divide it."""
     return NamedSharding(mesh, partition(("batch",), (batch,), mesh, leaf="The batch of scenes"))
 
@@ -213,12 +219,15 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
-def describe(specs: Tree, mesh: Mesh) -> str:
-    """A table, one line per leaf: path, shape, PartitionSpec, bytes on each device; then the sums."""
+def describe(specs: Tree, mesh: AnyMesh, dtype: Callable[[str], Any] | None = None) -> str:
+    """A table, one line per leaf: path, shape, PartitionSpec, bytes on each device; then the sums.
+
+    `dtype(path)` says what a leaf is kept in, if that is not its spec's own.
+    """
     rows, here, whole = [("leaf", "shape", "split over", "bytes per device")], 0, 0
     where = flatten(shardings(specs, mesh))
     for path, spec in flatten(specs).items():
-        item = jnp.dtype(spec.dtype).itemsize
+        item = jnp.dtype(spec.dtype if dtype is None else dtype(path)).itemsize
         share = math.prod(where[path].shard_shape(spec.shape)) * item
         split = ", ".join("-" if e is None else str(e) for e in where[path].spec) or "-"
         rows.append((path, str(tuple(spec.shape)), split, f"{share:,}"))
@@ -234,11 +243,13 @@ def describe(specs: Tree, mesh: Mesh) -> str:
 
 # ---- activations ---------------------------------------------------------------------------------
 
-_MESH: contextvars.ContextVar[Mesh | None] = contextvars.ContextVar("roge_jax_mesh", default=None)
+_MESH: contextvars.ContextVar[AnyMesh | None] = contextvars.ContextVar(
+    "roge_jax_mesh", default=None
+)
 
 
 @contextlib.contextmanager
-def use(mesh: Mesh | None) -> Iterator[Mesh | None]:
+def use(mesh: AnyMesh | None) -> Iterator[AnyMesh | None]:
     """The mesh that `constrain` means while functions are traced.
 
     JAX keeps one trace per jitted function and argument shapes and does not see this setting: jit a function anew
@@ -251,7 +262,7 @@ def use(mesh: Mesh | None) -> Iterator[Mesh | None]:
         _MESH.reset(token)
 
 
-def current() -> Mesh | None:
+def current() -> AnyMesh | None:
     return _MESH.get()
 
 

@@ -19,7 +19,7 @@ from ..core.lora import attach
 from ..core.params import Tree
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
-from ..video import vae, vae_training
+from ..video import dit, vae, vae_training
 from .optim import OptimConfig
 
 
@@ -34,7 +34,7 @@ class Stage:
     views: ViewConfig = field(default_factory=ViewConfig)
     draws: int = 1  # noise levels per scene and step
     lora: bool = False  # add LoRA factors to what trains
-    remat: str = "dots"  # what the transformer's backward pass recomputes: none, dots or full
+    remat: dit.Remat = "dots"  # what the transformer's backward pass recomputes
     crop: int | None = None  # side of random square crops (VAE stages)
     recon_shrink: int = 1  # divides the size at which the reconstruction works
 
@@ -101,17 +101,20 @@ _SCRATCH = OptimConfig(
     name="muon", learning_rate=2e-3, warmup=60, decay=0.5, weight_decay=0.0, ema=0.998
 )
 
+_GENTLE = dataclasses.replace(_SCRATCH, learning_rate=1e-3)
+
 
 def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
     video = ViewConfig(targets=frames, ordered=True)
     images = ViewConfig(targets=1)
-    short, longer = (ViewConfig(targets=n, ordered=True) for n in (5, 9))
+    short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
-        Stage("vae_longer", "vae", "^vae/", 200, 2, _SCRATCH, longer, crop=64),
+        # Whole windows: after short clips alone, frames from the sixth on lose up to 6 dB.
+        Stage("vae_longer", "vae", "^vae/", 800, 1, _GENTLE, video, crop=64),
         Stage(
             "recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2
         ),
@@ -179,6 +182,14 @@ def new_leaves(config: RoGeConfig, stage: Stage) -> Tree:
     """Specs of the LoRA factors that a stage adds to the model."""
     adapters = model.adapter_specs(config)
     return {"dit": adapters["dit"]} if stage.name == "hires" else adapters
+
+
+def stage_specs(config: RoGeConfig, stage: Stage) -> tuple[Tree, Tree]:
+    """Specs of the leaves that a stage trains, LoRA factors included, and of those that its objective reads as well."""
+    trained, frozen = model.split(model.specs(config), stage.trains)
+    if stage.lora:
+        trained = attach(trained, new_leaves(config, stage))
+    return trained, {} if stage.objective in ("vae", "recon") else frozen
 
 
 def measure_latents(

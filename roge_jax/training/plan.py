@@ -1,0 +1,269 @@
+"""What a training step costs before it runs: work and memory of every device, from specs and sizes alone.
+
+The step is traced on abstract arrays (`core.program`); no weight is made or read. Exact for weights, optimiser and
+FLOPs; memory of activations comes from the order and fusion rules described there. `docs/scaling.md` compares it with
+XLA's own analysis.
+"""
+
+import dataclasses
+import functools
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from .. import cost
+from ..config import RoGeConfig
+from ..core import program, sharding
+from ..core.params import Tree, abstract, count, flatten, unflatten
+from ..recon.vggt import encoder_grid
+from .loop import initial_state, make_step
+from .optim import make_optimiser
+from .stages import OBJECTIVES, Stage, stage_config, stage_specs
+
+# Names that `model` gives to its parts, as shown to people.
+PARTS = {
+    "vae": "VAE",
+    "reconstruct": "reconstruct",
+    "rays": "query rays",
+    "picture": "RGB head",
+    "condition": "condition",
+    "transformer": "transformer",
+}
+PASSES = ("forward", "recomputed", "backward")
+GB = 1e9
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """One training step on one device."""
+
+    tokens: dict[str, int]
+    parameters: dict[str, int]  # trained, frozen
+    scenes: int  # of the batch, on this device
+    work: dict[str, dict[str, float]]  # part -> pass -> FLOPs
+    memory: dict[str, float]  # bytes: frozen weights, trained state, batch, activations
+    fullest: str  # where activations take the most
+
+    @property
+    def bytes(self) -> float:
+        return sum(self.memory.values())
+
+    @property
+    def flops(self) -> float:
+        return sum(sum(passes.values()) for passes in self.work.values())
+
+
+def abstract_batch(config: RoGeConfig, stage: Stage, m: int, scenes: int) -> Tree:
+    """Shapes of a stage's batch with m photos; `config` is the stage's own (`stage_config`)."""
+    n, views = stage.views.targets, m + stage.views.targets
+
+    def array(*shape: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((scenes, *shape), jnp.float32)
+
+    if stage.objective == "vae":
+        size = (stage.crop, stage.crop) if stage.crop else (config.height, config.width)
+        return {"target_rgb": array(n, *size, 3)}
+    return {
+        "context_rgb": array(m, config.height, config.width, 3),
+        "target_rgb": array(n, config.height, config.width, 3),
+        "K": array(views, 3, 3),
+        "c2w": array(views, 4, 4),
+        "vectors": array(m, 11),
+    }
+
+
+def abstract_frozen(specs: Tree, dtype: Any) -> Tree:
+    """Frozen leaves: large matrices in `dtype`, the VAE, norms and modulation in float32."""
+    flat = flatten(abstract(specs))
+    return unflatten(
+        {
+            path: x if cost.keeps_float32(path) else jax.ShapeDtypeStruct(x.shape, dtype)
+            for path, x in flat.items()
+        }
+    )
+
+
+def abstract_step(
+    config: RoGeConfig, stage: Stage, m: int, *, scenes: int, dtype: Any = jnp.float32
+) -> tuple[Callable, tuple]:
+    """(step, abstract arguments) of one optimiser step on `scenes` scenes of m photos; `step` is `make_step`'s."""
+    working = stage_config(config, stage)
+    specs, frozen_specs = stage_specs(config, stage)
+    optimiser = make_optimiser(stage.optim, specs, stage.steps)
+    objective = functools.partial(OBJECTIVES[stage.objective], config=working, stage=stage)
+    state = jax.eval_shape(
+        lambda trained: initial_state(trained, optimiser, stage.optim), abstract(specs)
+    )
+    key = jax.eval_shape(lambda: jax.random.key(0))
+    batch = abstract_batch(working, stage, m, scenes)
+    arguments = (state, abstract_frozen(frozen_specs, dtype), batch, key)
+    return make_step(objective, optimiser, stage.optim), arguments
+
+
+def plan(
+    config: RoGeConfig,
+    stage: Stage,
+    *,
+    m: int | None = None,
+    mesh: sharding.AnyMesh | None = None,
+    dtype: Any = jnp.float32,
+    fused_attention: bool = False,
+) -> Plan:
+    """What one device of `mesh` (None: a single one) does and holds in a step with m photos (None: the most there are).
+
+    `dtype`: of frozen matrices. `fused_attention`: the scores of attention are never stored (GPU, bfloat16).
+    Raises UserError if the mesh does not divide the batch or a leaf.
+    """
+    m = max(stage.views.contexts) if m is None else m
+    working = stage_config(config, stage)
+    specs, frozen_specs = stage_specs(config, stage)
+    sizes = dict(mesh.shape) if mesh is not None else dict.fromkeys(sharding.MESH_AXES, 1)
+    scenes = stage.batch
+    if mesh is not None:
+        scenes = sharding.batch_sharding(mesh, stage.batch).shard_shape((stage.batch,))[0]
+    step, arguments = abstract_step(config, stage, m, scenes=scenes, dtype=dtype)
+    with sharding.use(mesh):
+        traced = program.trace(step, *arguments)
+
+    tokens = sequence_lengths(working, m)
+    split = {
+        "transformer": tokens["transformer tokens"],
+        "rays": min(m + working.frames, working.renderer.chunk),
+    }
+    heads = {c.width // c.heads for c in (config.encoder, config.renderer, config.dit)}
+    shares = {tuple(s.shape) for s in flatten(specs).values() if "embed" in s.axes}
+
+    def weigh(value: Any, scope: str) -> float:
+        size, shape = program.size(value), tuple(getattr(value, "shape", ()))
+        if fused_attention and "scores" in scope and not heads.intersection(shape):
+            return 0.0
+        if shape in shares:  # a gradient lies where its parameter does
+            return size / sizes["fsdp"]
+        whole = split.get(part(scope))
+        if whole is not None and (whole in shape or whole * scenes in shape):
+            return size / whole * math.ceil(whole / sizes["seq"])
+        return size
+
+    peak = program.peak(traced, weigh)
+    work: dict[str, dict[str, float]] = {}
+    for label, value in program.flops(traced, lambda s: f"{part(s)} {which_pass(s)}").items():
+        name, _, kind = label.partition(" ")
+        share = (
+            sizes["seq"] if name in split else 1
+        )  # what `seq` does not split, its devices repeat
+        row = work.setdefault(PARTS.get(name, "optimiser"), dict.fromkeys(PASSES, 0.0))
+        row[kind] += value / share
+    order = [*PARTS.values(), "optimiser"]
+    by_part: dict[str, float] = {}
+    for held in peak.held:
+        name = f"{PARTS.get(part(held.scope), 'the rest')}, {which_pass(held.scope)}"
+        by_part[name] = by_part.get(name, 0.0) + held.bytes
+    state, frozen, batch, _ = arguments
+    return Plan(
+        tokens=tokens,
+        parameters={"trained": count(specs), "frozen": count(frozen_specs) if frozen_specs else 0},
+        scenes=scenes,
+        work={name: work[name] for name in order if name in work},
+        memory={
+            "frozen weights": _held(frozen, frozen_specs, mesh),
+            "trained weights and optimiser": _held(state, specs, mesh, state=True),
+            "batch": _tree_bytes(batch),
+            "activations and gradients": peak.bytes,
+        },
+        fullest=max(by_part, key=by_part.__getitem__, default="nowhere"),
+    )
+
+
+def part(scope: str) -> str:
+    """The part of the model that an operation belongs to; '' for none."""
+    found = re.search(rf"\b({'|'.join(PARTS)})\b", scope)
+    return found[1] if found else ""
+
+
+def which_pass(scope: str) -> str:
+    if "rematted_computation" in scope:
+        return "recomputed"
+    return "backward" if "transpose(" in scope else "forward"
+
+
+def sequence_lengths(config: RoGeConfig, m: int) -> dict[str, int]:
+    """How long the sequences of one scene are."""
+    rows, columns = encoder_grid(config.encoder, config.recon_height, config.recon_width)
+    rays = config.recon_height * config.recon_width // config.renderer.patch**2
+    return {
+        "scene tokens": m * rows * columns,
+        "rays per view": rays,
+        "views": m + config.frames,
+        "transformer tokens": cost.tokens_per_slot(config) * config.slots(m),
+    }
+
+
+def _tree_bytes(tree: Any) -> float:
+    return sum(program.size(x) for x in jax.tree.leaves(tree))
+
+
+def _held(tree: Any, specs: Tree, mesh, *, state: bool = False) -> float:
+    """Bytes on one device of arrays that lie where the table says."""
+    if mesh is None or not specs:
+        return _tree_bytes(tree)
+    where = (
+        sharding.state_shardings(tree, specs, mesh) if state else sharding.shardings(specs, mesh)
+    )
+    held = jax.tree.map(lambda x, s: _share(x, s), tree, where)
+    return sum(jax.tree.leaves(held))
+
+
+def _share(x: Any, where: jax.sharding.NamedSharding) -> float:
+    return program.size(jax.ShapeDtypeStruct(where.shard_shape(x.shape), x.dtype))
+
+
+# ---- how much to recompute -----------------------------------------------------------------------
+
+LARGE = 1e9  # transformer parameters from which a step recomputes its blocks: see docs/scaling.md
+
+
+def default_remat(config: RoGeConfig) -> str:
+    """What the transformer's backward pass recomputes unless the user says otherwise: enough for 80 GB."""
+    from ..video.dit import dit_specs
+
+    return "full" if count(dit_specs(config.dit)) > LARGE else "dots"
+
+
+def report(
+    found: Plan,
+    config: RoGeConfig,
+    stage: Stage,
+    *,
+    m: int,
+    mesh: sharding.AnyMesh | None,
+    dtype: str,
+) -> str:
+    """What `train --dry-run` prints."""
+    working = stage_config(config, stage)
+    layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
+    counts = found.parameters
+    lines = [
+        f"stage     {stage.name} of {config.name}: {counts['trained'] / 1e6:,.1f} M parameters train, "
+        f"{counts['frozen'] / 1e6:,.1f} M are frozen ({dtype})",
+        f"step      {stage.batch} scenes of {m} photos and {stage.views.targets} targets at "
+        f"{working.height}x{working.width} (reconstruction at {working.recon_height}x{working.recon_width})"
+        + (f", {stage.draws} noise levels each" if stage.draws > 1 else ""),
+        f"devices   {layout}: {found.scenes} scenes each; the transformer recomputes: {stage.remat}",
+        "tokens    " + ", ".join(f"{n:,} {name}" for name, n in found.tokens.items()),
+        "",
+        f"{'FLOPs of one device, one step':30s}" + "".join(f"{name:>14s}" for name in PASSES),
+    ]
+    for name, passes in found.work.items():
+        cells = (cost.scaled(passes[kind], "") if passes[kind] else "" for kind in PASSES)
+        lines.append(f"{name:30s}" + "".join(f"{cell:>14s}" for cell in cells))
+    lines += [f"{'all':30s}{cost.scaled(found.flops, 'FLOP'):>14s}", "", "bytes of one device"]
+    lines += [f"{name:30s}{cost.scaled(n, 'B'):>14s}" for name, n in found.memory.items()]
+    lines.append(f"{'all':30s}{cost.scaled(found.bytes, 'B'):>14s}")
+    lines.append(
+        f"activations take the most in: {found.fullest}; XLA's scratch space is not counted, allow 10 %"
+    )
+    return "\n".join(lines)
