@@ -279,7 +279,12 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     loss = jax.jit(
         jax.value_and_grad(
             functools.partial(
-                vae_training.vae_loss, cfg=SMALL, kl=0.5, l1=0.25, colour=(1.0, 3.0, 5.0)
+                vae_training.vae_loss,
+                cfg=SMALL,
+                kl=0.5,
+                l1=0.25,
+                colour=(1.0, 3.0, 5.0),
+                anchor=0.125,
             ),
             has_aux=True,
         )
@@ -294,7 +299,9 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
     green = (2 * error[..., 1] - error[..., 0] - error[..., 2]) ** 2 / 6
     colour = 3 * error.var(-1)  # both colour axes
     weighted = mse + np.mean(2.0 * colour + 2.0 * green) / 3  # 3 times red-blue, 5 times green
-    np.testing.assert_allclose(value, weighted + 0.25 * mae + 0.5 * kl, rtol=1e-5)
+    anchor = np.mean((mu[..., -2:] - vae_training.block_colours(video[:1])) ** 2)
+    expected = weighted + 0.25 * mae + 0.5 * kl + 0.125 * anchor
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
     np.testing.assert_allclose(metrics["psnr"], 20 * np.log10(2) - 10 * np.log10(mse), rtol=1e-5)
 
     for path, grad in flatten(grads).items():
@@ -303,6 +310,17 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
             assert not np.any(grad), path
         elif grad.ndim == 5:
             assert np.any(grad[-1]) and not np.any(grad[:-1]), path
+
+
+def test_block_colours_are_means_over_the_pixels_and_frames_of_a_latent():
+    video = np.zeros((5, 16, 8, 3), np.float32)
+    video[0, :8] = [0.5, 0.0, -0.5]  # red: the first axis
+    video[3, 8:] = [0.4, -0.8, 0.4]  # magenta in one frame of four: the second
+    got = np.asarray(vae_training.block_colours(jnp.asarray(video)))
+    expected = np.zeros((2, 2, 1, 2))
+    expected[0, 0] = [[12 / np.sqrt(2), 0]]
+    expected[1, 1] = [[0, 12 * np.sqrt(6) * 0.4 / 4]]
+    np.testing.assert_allclose(got, expected, atol=1e-5)
 
 
 def test_norm_has_a_finite_gradient_at_zero():

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..config import VAEConfig
 from ..core.params import Tree, flatten, unflatten
-from .vae import decode_raw, encode_moments, vae_specs
+from .vae import SPACE, TIME, decode_raw, encode_moments, vae_specs
 
 OPPONENT = np.array([[1, 1, 1], [1, 0, -1], [1, -2, 1]]) / np.sqrt([[3], [2], [6]])  # colour axes
 
@@ -53,6 +53,15 @@ def _passthrough(module: str, kernel: np.ndarray, noise: float) -> np.ndarray:
     return kernel
 
 
+def block_colours(video: jax.Array) -> jax.Array:
+    """Mean colour of each latent's pixels [t', h/8, w/8, 2] along red-blue and green-magenta, at a spread near 1."""
+    t, h, w, _ = video.shape
+    blocks = (video @ (12.0 * OPPONENT[1:].T)).reshape(t, h // SPACE, SPACE, w // SPACE, SPACE, 2)
+    frames = blocks.mean((2, 4))
+    later = frames[1:].reshape(-1, TIME, *frames.shape[1:]).mean(1)
+    return jnp.concatenate([frames[:1], later])
+
+
 def vae_loss(
     p: Tree,
     video: jax.Array,
@@ -61,13 +70,15 @@ def vae_loss(
     cfg: VAEConfig,
     kl: float = 5e-5,
     l1: float = 0.1,
-    colour: tuple[float, float, float] = (1.0, 8.0, 16.0),
+    colour: tuple[float, float, float] = (1.0, 8.0, 8.0),
+    anchor: float = 0.05,
 ) -> tuple[jax.Array, dict]:
     """Reconstruction of video [t, h, w, 3] from sampled latents: error + l1 * mae + kl * KL, means over elements.
 
     `colour` weighs the squared error along the orthonormal axes grey, red against blue and green against magenta. The
     last two hold one and two hundredths of the variance of brightness; unweighted, a small VAE stays grey for
-    thousands of steps (neither half gains by passing on colours that the other ignores).
+    thousands of steps, and weighted it finds one of them and loses the other: neither half gains by passing on what
+    the other ignores. `anchor` therefore draws the last two latent channels towards `block_colours` of the video.
 
     Also returns {"mse", "mae", "kl", "psnr"}; the PSNR (dB, range 2) is that of the sampled reconstruction.
     """
@@ -81,4 +92,5 @@ def vae_loss(
     divergence = 0.5 * (jnp.square(mu) + jnp.exp(log_var) - 1 - log_var).mean()
     psnr = 10 * jnp.log10(4 / jnp.maximum(mse, 1e-12))
     metrics = {"mse": mse, "mae": mae, "kl": divergence, "psnr": psnr}
-    return weighted + l1 * mae + kl * divergence, metrics
+    anchored = jnp.square(mu[..., -2:] - block_colours(video)).mean()
+    return weighted + l1 * mae + kl * divergence + anchor * anchored, metrics
