@@ -19,6 +19,7 @@ _PUBLIC = {
     "Scene": ("data.scene", "Scene"),
     "load_scene": ("data.scene", "load_scene"),
     "make_path": ("geometry.trajectories", "make_path"),
+    "plan": ("planning.plan", "plan"),
     "UserError": ("errors", "UserError"),
 }
 _MODULES = (

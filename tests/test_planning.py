@@ -1,0 +1,347 @@
+"""The planner on the tiny model: monotone, deterministic, within budget, and at tolerance 0 the full model itself."""
+
+import dataclasses
+import types
+
+import jax
+import numpy as np
+import pytest
+from scene_files import nerfstudio, truth
+
+import roge_jax as rj
+from roge_jax import checkpoint, cost, entry, model, sample, sampling
+from roge_jax.config import preset
+from roge_jax.data.scene import load_scene
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import Cameras
+from roge_jax.geometry.trajectories import make_path
+from roge_jax.planning import coverage, proxies, table
+from roge_jax.planning.plan import full_choices
+from roge_jax.recon.ray_scene import attend, merge_scene
+
+CONFIG = preset("tiny")
+SETTINGS = sampling.Settings(steps=12)
+TOLERANCES = (0.0, 1e-4, 0.003, 0.01, 0.02, 0.03, 0.05, 0.08, 0.13, 0.2, 0.5)
+
+
+@pytest.fixture(scope="module")
+def weights():
+    params = model.init(jax.random.key(0), CONFIG)
+    rng = np.random.default_rng(0)
+
+    def fill(leaf):  # the published initialisation is zero here: nothing would depend on anything
+        return np.asarray(0.1 * rng.standard_normal(leaf.shape), np.float32)
+
+    params["dit"]["head"]["linear"]["kernel"] = fill(params["dit"]["head"]["linear"]["kernel"])
+    head = params["renderer"]["rgb_head"]["linear"]
+    head["kernel"] = fill(head["kernel"])
+    return params
+
+
+@pytest.fixture(scope="module")
+def folder(weights, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("planning")
+    checkpoint.save_model(folder / "model", weights, CONFIG, dtype=np.float32)
+    nerfstudio(folder / "scene", truth(4))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def photos(folder):
+    return sampling.read_photos(load_scene(folder / "scene"), [0, 1, 2, 3], CONFIG)
+
+
+@pytest.fixture(scope="module")
+def path(photos):
+    return make_path("orbit", photos.cameras, 2 * CONFIG.frames, degrees=20)
+
+
+@pytest.fixture(scope="module")
+def compiled():
+    return {}
+
+
+@pytest.fixture(scope="module")
+def make(weights, photos, path, compiled):
+    def plan(tolerance, **options):
+        options = {"settings": SETTINGS, "compiled": compiled} | options
+        return rj.plan(
+            weights,
+            CONFIG,
+            options.pop("photos", photos),
+            options.pop("path", path),
+            tolerance=tolerance,
+            **options,
+        )
+
+    return plan
+
+
+# ---- what is promised ----------------------------------------------------------------------------
+
+
+def test_a_smaller_tolerance_never_costs_less(make):
+    plans = [make(tolerance) for tolerance in TOLERANCES]
+    costs = [plan.predicted_cost for plan in plans]
+    assert costs == sorted(costs, reverse=True)
+    assert len(set(costs)) >= 4 and costs[-1] < 0.5 * costs[0]  # the knobs are real
+    for tolerance, plan in zip(TOLERANCES, plans, strict=True):
+        assert plan.predicted_error <= tolerance
+        assert plan.full_cost == costs[0]
+
+
+def test_tolerance_zero_leaves_nothing_out_and_measures_nothing(make, photos, path):
+    plan = make(0.0)
+    assert plan.choices == full_choices(photos, CONFIG, path, SETTINGS)
+    assert plan.predicted_error == 0.0 and plan.planning_cost == 0.0
+    assert plan.predicted_cost == plan.full_cost and plan.refused is None
+
+
+def test_tolerance_zero_is_the_full_model_bit_for_bit(weights, photos, path, make):
+    cache = {}
+    settings = dataclasses.replace(SETTINGS, steps=2)
+    path = path[: CONFIG.frames]
+    whole = sampling.sample(weights, CONFIG, photos, path, settings, cache=cache)
+    programs = list(cache)
+    plan = make(0.0, settings=settings, path=path)
+    again = sampling.sample(weights, CONFIG, photos, path, settings, plan=plan, cache=cache)
+    assert list(cache) == programs  # the same compiled programs
+    assert again.frames.tobytes() == whole.frames.tobytes()
+    assert again.preview.tobytes() == whole.preview.tobytes()
+
+
+def test_plans_are_deterministic(make):
+    assert make(0.05) == make(0.05)
+    assert make(0.05).explain() == make(0.05).explain()
+
+
+def test_a_plan_stays_within_max_cost_or_says_what_is_needed(make):
+    full = make(0.0).full_cost
+    least = make(10.0, probe=0.0)
+    bottom = least.predicted_cost
+    for share in (0.1, 0.3, 0.6, 1.0, 1.5):
+        budget = bottom + share * full
+        plan = make(0.003, max_cost=budget)
+        assert plan.predicted_cost + plan.planning_cost <= budget
+        assert plan.predicted_error <= 0.003 or "does not buy" in plan.explain()
+    assert make(10.0, max_cost=bottom, probe=0.0).choices == least.choices
+    with pytest.raises(
+        UserError, match="less than the cheapest plan needs: give at least"
+    ) as error:
+        make(0.02, max_cost=0.99 * bottom, probe=0.0)
+    needed = float(str(error.value).split("at least ")[1].split(",")[0])
+    assert needed == pytest.approx(bottom, rel=1e-3)
+
+
+def test_a_budget_never_buys_a_worse_plan_when_it_grows(make):
+    full = make(0.0).full_cost
+    errors = [make(1e-4, max_cost=share * full).predicted_error for share in (0.4, 0.6, 0.8, 1.2)]
+    assert errors == sorted(errors, reverse=True) and errors[0] > errors[-1]
+
+
+@pytest.mark.parametrize("value", [-0.1, float("nan"), float("inf")])
+def test_bad_tolerances_take_one_sentence(make, value):
+    with pytest.raises(UserError, match=r"^tolerance .*: give a root-mean-square") as error:
+        make(value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, float("nan")])
+def test_bad_budgets_take_one_sentence(make, value):
+    with pytest.raises(UserError, match=r"^max_cost .*: give a positive number of FLOPs"):
+        make(0.02, max_cost=value)
+
+
+# ---- how it buys ---------------------------------------------------------------------------------
+
+
+def test_every_purchase_lowers_the_error_and_the_best_rate_comes_first(make):
+    plan = make(0.003)
+    start, *bought = plan.bought
+    assert bought and all(p.gain > 0 and p.flops > 0 for p in bought)
+    assert start.flops + sum(p.flops for p in bought) == pytest.approx(plan.predicted_cost)
+    assert -start.gain - sum(p.gain for p in bought) == pytest.approx(plan.predicted_error)
+    rates = [p.gain / p.flops for p in bought[:-1]]  # the last one is the cheapest that suffices
+    assert rates == sorted(rates, reverse=True)
+
+
+def test_explain_tells_what_was_bought_and_what_was_not(make):
+    plan = make(0.05)
+    text = plan.explain()
+    assert text.count("bought") == len(plan.bought) - 1 and "start" in text
+    assert ("refused" in text) == (plan.refused is not None)
+    assert f"predicted error {plan.predicted_error:.4f}" in text
+    assert "for 'mini', not for 'tiny'" in text  # the table is another model's
+
+
+def test_prices_are_those_of_the_cost_model(make):
+    plan = make(0.0)
+    windows = [cost.estimate(CONFIG, m, 12).total_flops for m in (4, 6)]  # chained: two frames more
+    assert plan.full_cost == pytest.approx(sum(windows))
+
+
+# ---- photos --------------------------------------------------------------------------------------
+
+
+def test_redundant_photos_are_not_bought_twice(make, photos):
+    """Photos from the same place add no coverage, whatever noise tells them apart."""
+    twice = [0, 1, 2, 3, 0, 1]
+    noise = np.random.default_rng(0).uniform(-0.01, 0.01, photos.images.shape)
+    images = np.clip(np.concatenate([photos.images, (photos.images + noise)[:2]]), 0.0, 1.0)
+    doubled = sampling.Photos(
+        images.astype(np.float32), None, photos.cameras[twice], tuple(range(6))
+    )
+    for tolerance in TOLERANCES[1:]:
+        kept = make(tolerance, photos=doubled, probe=0.0).choices.photos
+        places = [twice[i] for i in kept]
+        assert len(set(places)) == len(places) or len(kept) == 6
+    worth = coverage.coverage(doubled.cameras, doubled.cameras, CONFIG.height, CONFIG.width)
+    assert sorted(photo for photo, _ in coverage.greedy(worth)) == [0, 1, 2, 3]
+
+
+def test_greedy_gains_fall_and_first_comes_who_sees_most(photos):
+    """The path is the third photo's own view: that photo sees all of it, exactly."""
+    own = photos.cameras[[2]]
+    worth = coverage.coverage(photos.cameras, own, CONFIG.height, CONFIG.width)
+    order = coverage.greedy(worth)
+    assert order[0][0] == 2 and order[0][1] == pytest.approx(1.0)
+    worth = coverage.coverage(photos.cameras, photos.cameras, CONFIG.height, CONFIG.width)
+    gains = [gain for _, gain in coverage.greedy(worth)]
+    assert gains == sorted(gains, reverse=True)
+    assert sum(gains) == pytest.approx(coverage.covered(worth, (0, 1, 2, 3)))
+
+
+def test_coverage_knows_no_unit_and_no_frame(photos, path):
+    def moved(cameras):
+        pose = np.eye(4)
+        pose[:3, :3] = np.linalg.qr(np.random.default_rng(1).standard_normal((3, 3)))[0]
+        pose[:3, :3] *= np.sign(np.linalg.det(pose[:3, :3]))
+        pose[:3, 3] = [30.0, -5.0, 12.0]
+        c2w = pose[None] @ cameras.c2w
+        c2w[:, :3, 3] *= 1e-3
+        return Cameras(cameras.K, c2w)
+
+    size = (CONFIG.height, CONFIG.width)
+    here = coverage.coverage(photos.cameras, path, *size)
+    there = coverage.coverage(moved(photos.cameras), moved(path), *size)
+    assert (
+        np.mean(np.abs(here - there) > 1e-6) < 0.002
+    )  # points on a picture's border may fall either way
+    assert here.min() >= 0 and here.max() <= 1 and here.mean() > 0.05
+
+
+def test_one_photo_can_be_planned_for(make, photos):
+    alone = sampling.Photos(photos.images[:1], None, photos.cameras[:1], (0,))
+    path = make_path("orbit", alone.cameras, 3)
+    plan = make(0.05, photos=alone, path=path)
+    assert plan.choices.photos == (0,) and plan.planning_cost == 0.0
+
+
+# ---- what a reduced run computes ------------------------------------------------------------------
+
+
+def test_targets_keep_their_noise_when_photos_are_dropped():
+    full = sampling.draw_noise(3, 0, 4, CONFIG)
+    fewer = full[-CONFIG.slots(2) :]
+    np.testing.assert_array_equal(fewer[2:], full[4:])
+
+
+def test_every_knob_changes_the_run_as_it_says(weights, photos, path):
+    full = full_choices(photos, CONFIG, path[:5], SETTINGS)
+    half = (CONFIG.recon_height // 2, CONFIG.recon_width // 2)
+    choices = dataclasses.replace(full, photos=(1, 3), steps=2, recon=half, merge=4)
+    cache = {}
+    result = run(weights, photos, path[:5], choices, cache)
+    assert result.evaluations == 2 and len(result.frames) == 5
+    assert result.preview.shape[1:3] == half and result.windows[0]["photos"] == [1, 3]
+    assert np.isfinite(result.frames).all()
+    ((count, generated, config),) = cache
+    assert (count, generated, config.renderer.merge) == (2, True, 4)
+
+
+def test_windows_that_are_not_generated_show_the_rgb_head(weights, photos, path):
+    full = full_choices(photos, CONFIG, path, SETTINGS)
+    half = (CONFIG.recon_height // 2, CONFIG.recon_width // 2)
+    choices = dataclasses.replace(full, photos=(2,), recon=half, generate=(False, False))
+    result = run(weights, photos, path, choices, {}, long="independent")
+    assert result.evaluations == 0 and all(window["rgb_head"] for window in result.windows)
+    shown = model.resized(jax.numpy.asarray(result.preview), CONFIG.height, CONFIG.width)
+    np.testing.assert_array_equal(result.frames, np.asarray(shown))
+    assert np.abs(result.frames[0] - result.frames[4]).max() > 1e-3
+
+
+def run(weights, photos, path, choices, cache, **settings):
+    plan = types.SimpleNamespace(choices=choices)
+    settings = dataclasses.replace(SETTINGS, **settings)
+    return sampling.sample(weights, CONFIG, photos, path, settings, plan=plan, cache=cache)
+
+
+def test_merged_tokens_are_means_of_neighbours():
+    grid = (3, 5)
+    x = np.arange(15, dtype=np.float32).reshape(1, 15, 1)
+    merged, _ = merge_scene(x, None, grid, 4)
+    assert merged.shape == (1, 2 * 3, 1)
+    cells = x.reshape(3, 5)
+    expected = [cells[a : a + 2, b : b + 2].mean() for a in (0, 2) for b in (0, 2, 4)]
+    np.testing.assert_allclose(np.asarray(merged)[0, :, 0], expected, rtol=1e-6)
+    pairs, _ = merge_scene(x, None, grid, 2)
+    np.testing.assert_allclose(np.asarray(pairs)[0, :3, 0], [0.5, 2.5, 4.0], rtol=1e-6)
+
+
+def test_merging_alike_tokens_changes_nothing(weights):
+    """Without positions, tokens that are all alike are worth no more than a quarter of them."""
+    p = jax.tree.map(lambda leaf: leaf[0], weights["renderer"]["blocks"]["cross_attn"])
+    rng, width = np.random.default_rng(0), CONFIG.renderer.width
+    rays, noise = (rng.standard_normal((1, 24, width)).astype(np.float32) for _ in range(2))
+    alike = np.repeat(noise[:, :1], 24, 1)
+
+    def read(tokens):
+        few, _ = merge_scene(tokens, None, (4, 6), 4)
+        assert few.shape[1] == 6
+        whole = attend(p, rays, tokens, CONFIG.renderer.heads)
+        return np.abs(attend(p, rays, few, CONFIG.renderer.heads) - whole).max()
+
+    assert read(alike) < 1e-6 < 1e-3 < read(noise)
+
+
+def test_leave_one_out_finds_what_a_perfect_head_would_not_miss(
+    weights, photos, compiled, monkeypatch
+):
+    """A head that paints them exactly has none."""
+    measured = proxies.leave_one_out(weights, CONFIG, photos, compiled)
+    assert measured["leave_one_out"] > 0.05 and 0 < measured["redundancy"] < 1
+    small = proxies.half_size(CONFIG)
+    truth = model.resized(jax.numpy.asarray(photos.images), small.recon_height, small.recon_width)
+    key = next(k for k in compiled if k[0] == "leave_one_out" and k[1] == 4)
+    known = {key: lambda params, batch: (truth, np.zeros(4))}
+    assert proxies.leave_one_out(weights, CONFIG, photos, known)["leave_one_out"] < 1e-6
+
+
+def test_what_costs_more_than_its_share_is_not_measured(make):
+    price = proxies.leave_one_out_price(CONFIG, 4)
+    full = make(0.0).full_cost
+    bought = make(0.05, probe=1.001 * price / full)
+    assert bought.planning_cost == price and "leave_one_out" in bought.measured
+    free = make(0.05, probe=0.999 * price / full)
+    assert free.planning_cost == 0.0 and list(free.measured) == ["detail"]
+
+
+def test_the_shipped_table_says_where_it_comes_from():
+    constants = table.load("mini")
+    assert constants.provenance["scenes"] and constants.provenance["command"]
+    assert all(step.error > 0 for step in constants.steps)
+    assert table.load("no such model").name == table.DEFAULT
+
+
+# ---- the program ---------------------------------------------------------------------------------
+
+
+def test_the_program_plans_and_says_so(folder, capsys):
+    words = ["--checkpoint", folder / "model", "--scene", folder / "scene", "--out", folder / "out"]
+    words = [str(w) for w in [*words, "--tolerance", 0.3, "--steps", 4]]
+    assert entry.execute(sample.main, sample.parser(), words) == 0
+    assert "plan for tolerance 0.3" in capsys.readouterr().out
+    run = (folder / "out" / "run.json").read_text()
+    assert '"predicted_error"' in run and '"choices"' in run
+    assert entry.execute(sample.main, sample.parser(), [*words, "--max-cost", "1"]) == 2
+    assert "cheapest plan" in capsys.readouterr().err
