@@ -1,0 +1,148 @@
+"""Which parts of the small model earn their keep: every part removed or resized, at equal compute on one core.
+
+    OPENBLAS_NUM_THREADS=1 NPROC=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false taskset -c 0 \\
+        python experiments/ablation.py --data runs/pool         # results/ablation.{json,png}, docs/ablation.md
+
+One CPU core, about 55 core-minutes. Finished rows are in the JSON and are not run again (those of the shipped weights are
+when the weights change); `--only NAME ...` takes names or groups, `--redraw` only draws. Without `--data` scenes are
+rendered as they are needed, at no charge to the budgets. Four parts:
+
+  reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, M = 3, constant rate, averaged weights), every
+                  variant for the same core-seconds; PSNR of the RGB head on 32 held-out scenes, paired with the base
+  conditions      the shipped generator: held-out flow error by noise level with one condition zeroed or taken from
+                  another scene, 16 scenes, the same noise for all
+  finetune        the shipped generator trained on for equal steps while a condition is absent: what it can replace
+  lora            the LoRA stage at rank 32 on the shipped model: singular values of the update, and the held-out loss
+                  with the update cut to lower ranks
+
+A budget counts steps at the 10th percentile of the variant's own step times (CPU time of the process, data and
+evaluation apart), since other work on a machine only ever adds. The published system reports no such ablation at
+this size. Our numbers and what they are worth: docs/ablation.md.
+"""
+
+import argparse
+import hashlib
+import json
+import subprocess
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from ablation_parts import generator, reconstruction, report
+
+from roge_jax import checkpoint
+from roge_jax.config import preset
+from roge_jax.core.params import Tree, flatten
+from roge_jax.data.pool import read_pool
+from roge_jax.train import ProceduralSource
+
+OUT = Path(__file__).resolve().parent / "results"
+
+
+def fingerprint(params: Tree) -> str:
+    """Changes with any weight."""
+    digest = hashlib.sha256()
+    for path, x in flatten(params).items():
+        digest.update(path.encode() + np.asarray(x).tobytes())
+    return digest.hexdigest()[:12]
+
+
+class Job(NamedTuple):
+    group: str
+    settings: dict  # a row measured with other settings is measured again
+    measure: Callable[[], dict]
+
+
+def jobs(args: argparse.Namespace) -> dict[str, Job]:
+    """Everything to measure, in the order of the run."""
+    source = read_pool(args.data) if args.data else ProceduralSource(64, 112, 24)
+    mini, (params, config) = preset("mini"), checkpoint.load_model("mini")
+    weights = {"weights": fingerprint(params)}
+    found = {
+        name: Job(
+            "reconstruction",
+            {"steps": args.steps},
+            lambda v=variant: reconstruction.train(v, mini, source, args.steps),
+        )
+        for name, variant in reconstruction.VARIANTS.items()
+    }
+    return found | {
+        "conditions": Job("conditions", weights, lambda: generator.conditions(params, config)),
+        "lora": Job(
+            "lora",
+            weights | {"steps": args.lora_steps},
+            lambda: generator.lora(params, config, source, args.lora_steps),
+        ),
+        "finetune": Job(
+            "finetune",
+            weights | {"steps": args.finetune_steps},
+            lambda: generator.finetune(params, config, source, args.finetune_steps),
+        ),
+    }
+
+
+def measured(job: Job) -> dict:
+    """The row of a job, with what produced it."""
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=OUT.parent
+    )
+    cpu, wall = time.process_time(), time.perf_counter()
+    row = job.measure()
+    row |= {
+        "settings": job.settings,
+        "all_core_seconds": time.process_time() - cpu,
+        "wall_seconds": time.perf_counter() - wall,
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "commit": commit.stdout.strip(),
+    }
+    return json.loads(json.dumps(row), parse_float=lambda text: float(f"{float(text):.5g}"))
+
+
+def stored(path: Path) -> dict[str, dict]:
+    """The finished rows, in the order in which they are shown."""
+    rows = json.loads(path.read_text())["rows"] if path.exists() else {}
+    order = [*reconstruction.VARIANTS, "conditions", "finetune", "lora"]
+    return dict(sorted(rows.items(), key=lambda item: order.index(item[0])))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, help="pool of training scenes (default: render)")
+    parser.add_argument("--steps", type=int, default=80, help="of the base reconstruction")
+    parser.add_argument("--lora-steps", type=int, default=60)
+    parser.add_argument("--finetune-steps", type=int, default=40)
+    parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")
+    parser.add_argument("--redraw", action="store_true", help="only tables and chart")
+    parser.add_argument("--out", type=Path, default=OUT, help="folder of ablation.{json,png}")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / "ablation.json"
+    for name, job in {} if args.redraw else jobs(args).items():
+        if args.only and not {name, job.group} & set(args.only):
+            continue
+        if stored(path).get(name, {}).get("settings") == job.settings:
+            print(f"{name}: done before", flush=True)
+            continue
+        row = measured(job)
+        rows = stored(path) | {name: row}  # read again: others may have written meanwhile
+        temporary = path.with_suffix(".part")
+        temporary.write_text(json.dumps({"rows": rows}, separators=(",", ":")) + "\n")
+        temporary.rename(path)
+        print(
+            f"{name}: {row['all_core_seconds']:.0f} core-s, {row['wall_seconds']:.0f} s", flush=True
+        )
+        jax.clear_caches()
+    rows = stored(path)
+    report.draw(rows, args.out / "ablation.png")
+    if args.out == OUT:
+        report.write_tables(rows, OUT.parents[1] / "docs" / "ablation.md")
+
+
+if __name__ == "__main__":
+    main()

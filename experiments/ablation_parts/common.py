@@ -1,0 +1,51 @@
+"""Held-out samples and the clock of the ablation."""
+
+import dataclasses
+import functools
+import time
+
+import jax
+import numpy as np
+
+from roge_jax.config import RoGeConfig
+from roge_jax.data.procedural import HELDOUT_SEED, sample_sequence
+from roge_jax.training import stages
+
+SIGMAS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
+CONTEXTS, SCENES, CLIPS = 3, 32, 16  # of a sample; held-out for reconstruction; for generation
+
+
+@functools.cache
+def heldout_sequences(n: int, height: int, width: int) -> list[dict]:
+    return [
+        sample_sequence(HELDOUT_SEED + i, height=height, width=width, depth=False) for i in range(n)
+    ]
+
+
+def heldout(stage: stages.Stage, config: RoGeConfig, scenes: int) -> list[dict[str, np.ndarray]]:
+    """One unaltered sample of `CONTEXTS` photos from each held-out scene, with a leading axis of one."""
+    views = dataclasses.replace(stage.views, augment=False, near=0.0, outside=0.0)
+    fixed = dataclasses.replace(stage, views=views, batch=1)
+    sequences = heldout_sequences(scenes, config.height, config.width)
+    return [stages.stage_batch([s], fixed, config, 0, i) for i, s in enumerate(sequences)]
+
+
+class Clock:
+    """CPU time of the process in steps, data and evaluation apart; the first step compiles and is kept apart."""
+
+    def __init__(self):
+        self.steps: list[float] = []
+
+    def run(self, step, *args):
+        began = time.process_time()
+        result = jax.block_until_ready(step(*args))
+        self.steps.append(time.process_time() - began)
+        return result
+
+    def record(self) -> dict[str, float]:
+        return {
+            "steps": len(self.steps),
+            "core_seconds": float(np.mean(self.steps[1:]) * len(self.steps)),
+            "step_core_seconds": np.quantile(self.steps[1:], (0.1, 0.5, 0.9)).tolist(),
+            "first_step_core_seconds": self.steps[0],
+        }

@@ -1,0 +1,192 @@
+"""The ablation: what it changes is what it says, its rank arithmetic, its verdicts."""
+
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
+
+from ablation_parts import common, generator, reconstruction, report
+
+from roge_jax import model
+from roge_jax.config import preset
+from roge_jax.core.layers import patch_conv
+from roge_jax.core.params import abstract, flatten, init
+from roge_jax.train import ProceduralSource
+
+TINY = preset("tiny")
+VARIANTS = reconstruction.VARIANTS
+UNLIKE = ("bidirectional", "full attention", "no registers", "no rays in the encoder")
+
+
+def factors(rank=6, d_in=10, d_out=8, layers=3, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.standard_normal((layers, d_in, rank)).astype(np.float32)
+    b = rng.standard_normal((layers, rank, d_out)).astype(np.float32)
+    return {"dit": {"blocks": {"ffn": {"fc1": {"lora_a": a, "lora_b": b}}}}}
+
+
+def product(lora):
+    leaf = lora["dit"]["blocks"]["ffn"]["fc1"]
+    return np.asarray(leaf["lora_a"], np.float64) @ np.asarray(leaf["lora_b"], np.float64)
+
+
+def test_factored_singular_values_are_those_of_the_product():
+    lora = factors()
+    u, s, vt = generator.factor_svd(*lora["dit"]["blocks"]["ffn"]["fc1"].values())
+    want = np.linalg.svd(product(lora), compute_uv=False)
+    np.testing.assert_allclose(s, want[:, :6], rtol=1e-10)
+    np.testing.assert_allclose(u * s[:, None] @ vt, product(lora), atol=1e-10)
+
+
+@pytest.mark.parametrize("rank", [0, 2, 6])
+def test_a_truncated_update_is_the_best_of_its_rank(rank):
+    lora = factors()
+    cut = generator.truncated(lora, rank)
+    shapes = [{p: x.shape for p, x in flatten(t).items()} for t in (cut, lora)]
+    assert shapes[0] == shapes[1]
+    full = np.linalg.svd(product(lora), compute_uv=False)
+    left = np.linalg.norm(product(lora) - product(cut), axis=(1, 2))
+    np.testing.assert_allclose(left, np.sqrt((full[:, rank:] ** 2).sum(1)), atol=1e-4)
+
+
+def test_a_layer_narrower_than_the_rank_keeps_its_shapes():
+    lora = factors(rank=12)
+    cut = generator.truncated(lora, 12)
+    np.testing.assert_allclose(product(cut), product(lora), atol=1e-4)
+
+
+def test_spectrum_of_a_known_update():
+    u = np.linalg.qr(np.random.default_rng(0).standard_normal((10, 4)))[0]
+    a, b = u * np.array([4.0, 2.0, 0.0, 0.0]), np.eye(4, 8)
+    lora = {"dit": {"blocks": {"ffn": {"fc1": {"lora_a": a[None], "lora_b": b[None]}}}}}
+    found = generator.spectrum(lora)
+    assert list(found) == ["generator MLP"]
+    row = found["generator MLP"]
+    np.testing.assert_allclose(row["relative"], [1, 0.5, 0, 0], atol=1e-12)
+    assert row["stable_rank"] == pytest.approx(20 / 16)
+    assert (row["rank_90"], row["rank_99"]) == (2, 2)  # 80 % of the energy is in the first
+
+
+def test_every_adapted_layer_of_the_transformer_blocks_has_a_family():
+    paths = [p for p in flatten(model.adapter_specs(preset("mini"))) if p.endswith("lora_a")]
+    rules = generator.FAMILIES.values()
+    blocks = [p for p in paths if "blocks/" in p]
+    hits = [sum(bool(generator.re.search(rule, p)) for rule in rules) for p in blocks]
+    assert blocks and set(hits) == {1}
+
+
+def test_every_variant_builds():
+    """Shapes only: the objective of each variant is traced, nothing is compiled."""
+    programs = {}
+    for name, variant in VARIANTS.items():
+        stage, _, specs, objective, _ = reconstruction.program(variant, TINY, 10)
+        assert variant.reference in VARIANTS
+        full = reconstruction.varied(preset("mini"), variant)
+        programs[name] = (full.encoder, full.renderer, stage.optim, variant.hide, variant.seed)
+        if name in UNLIKE:
+            v, h, w = common.CONTEXTS + stage.views.targets, TINY.height, TINY.width
+            shapes = {
+                "context_rgb": (common.CONTEXTS, h, w, 3),
+                "target_rgb": (stage.views.targets, h, w, 3),
+                "K": (v, 3, 3),
+                "c2w": (v, 4, 4),
+                "vectors": (common.CONTEXTS, 11),
+            }
+            batch = {n: jax.ShapeDtypeStruct((2, *s), np.float32) for n, s in shapes.items()}
+            loss, _ = jax.eval_shape(objective, abstract(specs), {}, batch, jax.random.key(0))
+            assert loss.shape == ()
+    assert len({str(p) for p in programs.values()}) == len(VARIANTS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["no registers", "full attention"])
+def test_a_variant_trains_and_is_scored(name):
+    source = ProceduralSource(TINY.height, TINY.width, 24)
+    row = reconstruction.train(VARIANTS[name], TINY, source, 3, scenes=3)
+    assert row["skipped"] == 0 and len(row["psnr"]) == 3
+    assert all(5 < p < 40 for p in row["psnr"])
+    budget = 3 * reconstruction.step_flops(VARIANTS["base"], TINY) / 1e12
+    assert row["tera_flop"] == pytest.approx(budget, rel=0.5)  # whole steps
+
+
+def test_budget_counts_what_a_variant_adds():
+    flops = {n: reconstruction.step_flops(v, preset("mini")) for n, v in VARIANTS.items()}
+    base = flops["base"]
+    for part in ("encoder depth", "renderer depth", "width"):
+        sizes = sorted((int(n.split()[-1]), f) for n, f in flops.items() if n.startswith(part))
+        assert [f for _, f in sizes] == sorted(f for _, f in sizes)
+        assert sizes[0][1] < base < sizes[-1][1]
+    same = ("base, seed 1", "no rays in the encoder", "all cameras absolute")
+    assert all(flops[n] == base for n in same)
+    assert flops["no registers"] < base < flops["bidirectional"]
+    assert flops["AdamW 1e-3"] < base  # no iterations of Newton and Schulz
+
+
+def test_hidden_rays_change_nothing():
+    specs, _ = model.split(model.specs(TINY), "^encoder/patch_encoder/")
+    params = init(jax.random.key(0), specs)
+    one = np.random.default_rng(0).standard_normal((2, 16, 24, 9)).astype(np.float32)
+    other = one + np.array([0.0] * 3 + [1.0] * 6, np.float32)[None, None, None]
+
+    def embed(p, x):
+        return np.asarray(patch_conv(p["encoder"]["patch_encoder"]["patch_embed"], x))
+
+    blind = reconstruction.blind(params, "rays")
+    np.testing.assert_array_equal(embed(blind, one), embed(blind, other))
+    assert not np.allclose(embed(params, one), embed(params, other))
+    shared = one * np.array([1.0] * 3 + [0.0] * 6, np.float32)[None, None, None]
+    np.testing.assert_allclose(embed(blind, one), embed(params, shared), atol=1e-5)
+
+
+def test_altered_conditions_are_those_named():
+    rng = np.random.default_rng(0)
+    shapes = {"x0": (3, 5, 4, 4, 2), "rays": (3, 6, 8), "features": (3, 6, 4)}
+    clips = {n: rng.standard_normal(s) for n, s in shapes.items()}
+    clips |= {"known": clips["x0"][:, :2], "seen": clips["x0"][:, :2]}
+    for name, case in generator.altered(clips).items():
+        assert case["x0"] is clips["x0"]  # the truth that is asked for never changes
+        changed = {n for n in clips if not np.array_equal(case[n], clips[n])}
+        what, _, how = name.partition(": ")
+        want = {
+            "all conditions": set(),
+            "rays": {"rays"},
+            "ray features": {"features"},
+            "rays and ray features": {"rays", "features"},
+            "context latents": {"known", "seen"},
+        }[what]
+        assert changed == want
+        for n in changed:
+            if how == "zero":
+                assert not case[n].any()
+            else:
+                np.testing.assert_array_equal(case[n][1], clips[n][0])
+
+
+def made_up(psnr, question="depth", **more):
+    return {"group": "reconstruction", "question": question, "reference": "base"} | {
+        "psnr": list(psnr), "halfway": 15.0, "parameters": 1e6, "steps": 3, "core_seconds": 1.0
+    } | more  # fmt: skip
+
+
+def test_differences_are_paired_and_judged_against_the_seed():
+    base = np.array([10.0, 20.0, 15.0, 30.0])
+    rows = {
+        "base": made_up(base, "seed"),
+        "base, seed 1": made_up(base + 0.2, "seed"),
+        "good": made_up(base + 1.1),
+        "bad": made_up(base - 1.0 + np.array([0.1, -0.1, 0.0, 0.0])),
+        "like a seed": made_up(base + 0.2),
+        "orphan": made_up(base, reference="missing"),
+    }
+    assert report.seed_noise(rows) == pytest.approx(0.2)
+    good = report.difference(rows, "good")
+    assert (good["mean"], good["low"], good["high"]) == pytest.approx((1.0, 1.0, 1.0))
+    words = {n: report.verdict(report.difference(rows, n), 0.2) for n in list(rows)[2:5]}
+    assert words == {"good": "better", "bad": "worse", "like a seed": "undecided"}
+    table = report.tables(report.ready(rows))
+    assert "| good | 1.00 | 3 |" in table and "+1.00 [+1.00, +1.00]" in table
+    assert "orphan" not in table
