@@ -1,23 +1,21 @@
-"""Which parts of the small model earn their keep: every part removed or resized, at equal compute on one core.
+"""Which parts of the small model earn their keep: every part removed or resized, at equal compute.
 
     OPENBLAS_NUM_THREADS=1 NPROC=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false taskset -c 0 \\
         python experiments/ablation.py --data runs/pool         # results/ablation.{json,png}, docs/ablation.md
 
-One CPU core, about 55 core-minutes. Finished rows are in the JSON and are not run again (those of the shipped weights are
-when the weights change); `--only NAME ...` takes names or groups, `--redraw` only draws. Without `--data` scenes are
-rendered as they are needed, at no charge to the budgets. Four parts:
+CPU, about an hour on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
+settings or the shipped weights that they measure have changed; several processes may share the work, each on its core
+with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Four groups:
 
-  reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, M = 3, constant rate, averaged weights), every
-                  variant for the same core-seconds; PSNR of the RGB head on 32 held-out scenes, paired with the base
-  conditions      the shipped generator: held-out flow error by noise level with one condition zeroed or taken from
-                  another scene, 16 scenes, the same noise for all
+  reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, 3 photos), every variant for the FLOPs of 80
+                  steps of the base; PSNR of the RGB head on 32 held-out scenes, paired with the base
+  conditions      the shipped generator: held-out flow error by noise level with a condition zeroed or taken from
+                  another scene, the same noise for all
   finetune        the shipped generator trained on for equal steps while a condition is absent: what it can replace
   lora            the LoRA stage at rank 32 on the shipped model: singular values of the update, and the held-out loss
                   with the update cut to lower ranks
 
-A budget counts steps at the 10th percentile of the variant's own step times (CPU time of the process, data and
-evaluation apart), since other work on a machine only ever adds. The published system reports no such ablation at
-this size. Our numbers and what they are worth: docs/ablation.md.
+The published system reports no such ablation. Our numbers and what they are worth: docs/ablation.md.
 """
 
 import argparse
@@ -60,7 +58,7 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
     """Everything to measure, in the order of the run."""
     source = read_pool(args.data) if args.data else ProceduralSource(64, 112, 24)
     mini, (params, config) = preset("mini"), checkpoint.load_model("mini")
-    weights = {"weights": fingerprint(params)}
+    weights = {"weights": fingerprint(params), "clips": args.clips}
     found = {
         name: Job(
             "reconstruction",
@@ -70,16 +68,20 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
         for name, variant in reconstruction.VARIANTS.items()
     }
     return found | {
-        "conditions": Job("conditions", weights, lambda: generator.conditions(params, config)),
+        "conditions": Job(
+            "conditions", weights, lambda: generator.conditions(params, config, args.clips)
+        ),
         "lora": Job(
             "lora",
             weights | {"steps": args.lora_steps},
-            lambda: generator.lora(params, config, source, args.lora_steps),
+            lambda: generator.lora(params, config, source, args.lora_steps, scenes=args.clips),
         ),
         "finetune": Job(
             "finetune",
             weights | {"steps": args.finetune_steps},
-            lambda: generator.finetune(params, config, source, args.finetune_steps),
+            lambda: generator.finetune(
+                params, config, source, args.finetune_steps, scenes=args.clips
+            ),
         ),
     }
 
@@ -115,6 +117,7 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, help="pool of training scenes (default: render)")
     parser.add_argument("--steps", type=int, default=80, help="of the base reconstruction")
+    parser.add_argument("--clips", type=int, default=16, help="held-out, for the generator")
     parser.add_argument("--lora-steps", type=int, default=60)
     parser.add_argument("--finetune-steps", type=int, default=40)
     parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")

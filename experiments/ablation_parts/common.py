@@ -12,7 +12,7 @@ from roge_jax.data.procedural import HELDOUT_SEED, sample_sequence
 from roge_jax.training import stages
 
 SIGMAS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
-CONTEXTS, SCENES, CLIPS = 3, 32, 16  # of a sample; held-out for reconstruction; for generation
+CONTEXTS, SCENES = 3, 32  # photos of a sample; held-out scenes for reconstruction
 
 
 @functools.cache

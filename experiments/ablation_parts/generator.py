@@ -19,7 +19,7 @@ from roge_jax.training import loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
 from roge_jax.video import flow
 
-from .common import CLIPS, CONTEXTS, SIGMAS, Clock, heldout
+from .common import CONTEXTS, SIGMAS, Clock, heldout
 
 RANKS = (0, 1, 2, 4, 8, 16, 32)
 FINETUNES = {  # gates of (rays, ray features) at the transformer
@@ -101,7 +101,7 @@ def altered(clips: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     return {label: clips | change for label, change in cases.items()}
 
 
-def conditions(params: Tree, config: RoGeConfig, scenes: int = CLIPS) -> dict:
+def conditions(params: Tree, config: RoGeConfig, scenes: int = 16) -> dict:
     clips = encode_all(params, heldout(video_stage(config), config, scenes), config)
     found = {name: flow_errors(params, case, config) for name, case in altered(clips).items()}
     return {
@@ -112,7 +112,7 @@ def conditions(params: Tree, config: RoGeConfig, scenes: int = CLIPS) -> dict:
 
 
 def finetune(
-    params: Tree, config: RoGeConfig, source, steps: int, *, clips: int = 32, scenes: int = CLIPS
+    params: Tree, config: RoGeConfig, source, steps: int, *, clips: int = 32, scenes: int = 16
 ) -> dict:
     """The transformer and the fusion trained on, each time with other conditions gated away."""
     stage = video_stage(config, batch=1)
@@ -221,7 +221,7 @@ def spectrum(lora: Tree) -> dict[str, dict]:
 
 
 def lora(
-    params: Tree, config: RoGeConfig, source, steps: int, *, rank: int = 32, scenes: int = CLIPS
+    params: Tree, config: RoGeConfig, source, steps: int, *, rank: int = 32, scenes: int = 16
 ) -> dict:
     """The paper's stage at a high rank for `steps` of one scene, then the update cut to lower ranks."""
     stage = stages.lora_stage(1, frames=config.frames)
