@@ -1,142 +1,160 @@
 """Find few-step grids for a trained model and store them for `--schedule optimised`.
 
-    python experiments/optimise_schedules.py [--checkpoint mini] [--solvers euler unipc_2] [--steps 4 6 8]
+    python experiments/optimise_schedules.py [--checkpoint mini] [--solvers ab2 euler ...] [--scenes 4]
 
-Writes roge_jax/video/schedules.json (grids; read by `flow.schedule("optimised", ...)`) and
-results/optimise_schedules.json (errors of shift, uniform and optimised grids on scenes not used in the search).
-For each training-split scene: teacher = midpoint with 48 steps on the graded grid; a first grid by dynamic programming
-over the teacher's Euler jump errors; then each point is moved where the sampler's own end error (relative L2 of
-the target latents to the teacher's, mean over scenes) is least. 4 + 2 scenes with 3 photos, seeds in the JSON.
-CPU: about 2000 network evaluations per solver and step count. Our numbers: see the JSON, if it is there.
+Repeat it after any training of the velocity network: the grids belong to the weights they were found on. Writes the
+entry of the model in roge_jax/video/schedules.json (grids and where they come from; read by
+`flow.schedule("optimised", ...)`) and results/optimise_schedules.json (errors on scenes that the search did not see).
+Teacher: midpoint, 48 steps, graded towards 0, on training-split scenes with 3 photos. A first grid by dynamic programming
+over the teacher's jump errors (Euler's, and the two-step method's); the better one, or shift, uniform or graded if
+they are better still, is then refined point by point on the sampler's own end error: the relative L2 distance of the target
+latents to the teacher's, mean over scenes. Budgets are 4, 6, 8 and 12 evaluations. About 2200 evaluations of the network
+on the whole batch for all solvers. Our numbers and times: the JSON.
 """
 
 import argparse
 import functools
 import json
+import time
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from quality.scenes import DEFAULT_M, Sampler, assemble, fingerprint, render
+
+from roge_jax import model
+from roge_jax.checkpoint import load_model
+from roge_jax.entry import enable_cache
+from roge_jax.video import flow, solvers
 
 OUT = Path(__file__).parent / "results"
-SEARCH, CHECK = (11, 12, 13, 14), (21, 22)
-TEACHER_STEPS, CONTEXTS = 48, 3
+SEARCH, CHECK = 11, 21  # first training-split seeds of the scenes for search and check
+TEACHER_STEPS = 48
+BUDGETS = (4, 6, 8, 12)
+SOLVERS = ("euler", "ab2", "unipc_2", "dpmpp_2m", "midpoint", "heun")
 
 
-def problems(params, config, seeds):
-    """[(prepared, noise)]: what the sampler needs of each scene."""
-    import jax
+def steps_for(solver: str, budget: int) -> int:
+    """The most steps within a budget of evaluations (one more where the last step is shorter)."""
+    return max(n for n in range(1, budget + 1) if n == 1 or solvers.nfe(solver, n) <= budget)
 
-    from roge_jax import model
-    from roge_jax.data.views import make_sample
-    from roge_jax.evaluate import read
 
-    prepare = jax.jit(functools.partial(model.prepare, config=config))
-    found = []
-    for seed in seeds:
-        scene = read(
-            f"procedural:{seed}", CONTEXTS, config.frames, (config.height, config.width), None
+class Problem:
+    """A batch of scenes with its teacher's result."""
+
+    def __init__(self, params: Any, config: Any, first: int, count: int, prepare: Any):
+        sequences = render(range(first, first + count), config)
+        self.sampler = Sampler(params, assemble(params, sequences, config, prepare=prepare), config)
+        self.fine = flow.schedule("graded", TEACHER_STEPS, power=1.5)
+        self.teacher = self.sampler.run("midpoint", self.fine).latents
+
+    def jump_errors(self) -> tuple[np.ndarray, np.ndarray]:
+        """Jump errors along the teacher's path, of Euler [k, k] and of the two-step method [k, k, k]."""
+        scenes, states, slopes = self.sampler.scenes, [], []
+
+        def seen(x, sigma):
+            v = self.sampler.velocity(x, sigma)
+            states.append(np.asarray(x)[:, scenes.m :])
+            slopes.append(np.asarray(v)[:, scenes.m :])
+            return v
+
+        for _ in solvers.iterate("midpoint", seen, scenes.noise, self.fine):
+            pass
+        # a step's first evaluation is at its start
+        x = np.stack([*states[::2], self.teacher])
+        v = np.stack([*slopes[::2], slopes[-1]])
+        return flow.euler_jump_errors(self.fine, x, v), flow.adams_jump_errors(self.fine, x, v)
+
+    def error(self, solver: str, grid: np.ndarray) -> float:
+        gap = jnp.linalg.norm((self.sampler.run(solver, grid).latents - self.teacher).reshape(len(self.teacher), -1), axis=1)  # fmt: skip
+        return float(
+            jnp.mean(gap / jnp.linalg.norm(self.teacher.reshape(len(self.teacher), -1), axis=1))
         )
-        views = make_sample(
-            scene["rgb"], scene["K"], scene["c2w"], CONTEXTS, scale_rule=config.scale_rule
-        )
-        views.pop("target_rgb")
-        noise = model.draw_noise(jax.random.key(seed), CONTEXTS, config=config)
-        found.append((prepare(params, views), noise))
-    return found
 
 
-def search(params, config, cases, held_out, solver_names, step_counts):
+def search(problem: Problem, check: Problem, names: list[str], shift: float):
     """({solver: {steps: grid}}, [record])"""
-    import jax
-    import jax.numpy as jnp
-
-    from roge_jax import model
-    from roge_jax.video import flow
-    from roge_jax.video.solvers import solve, tabulate
-
-    contexts = CONTEXTS
-
-    @jax.jit
-    def end(prepared, noise, table):
-        return model.generate(params, prepared, noise, config=config, solver=table)[0]
-
-    @jax.jit
-    def teacher(prepared, noise, table):
-        field, project = model.sampling_field(params, prepared, noise, config=config)
-        x0, info = solve(table, field, noise, project=project, keep_states=True)
-        return x0[contexts:], info.states
-
-    @jax.jit
-    def slopes(prepared, noise, states, sigmas):
-        field, project = model.sampling_field(params, prepared, noise, config=config)
-        looked = lambda x, s: field(project(x, s), s)[contexts:]  # noqa: E731
-        return jax.lax.map(lambda row: looked(*row), (states, sigmas))
-
-    fine = flow.schedule("graded", TEACHER_STEPS, power=1.5)
-    table = tabulate("midpoint", fine)
-    ends, errors = {}, 0.0
-    for which, group in (("search", cases), ("check", held_out)):
-        ends[which] = []
-        for prepared, noise in group:
-            x0, states = teacher(prepared, noise, table)
-            ends[which].append(x0)
-            if which == "search":
-                v = slopes(prepared, noise, states[:-1], jnp.asarray(fine[:-1], jnp.float32))
-                v = np.append(v, v[-1:], axis=0)
-                errors = errors + flow.euler_jump_errors(fine, states[:, contexts:], v)
-
-    def error(grid, solver, which="search"):
-        group = cases if which == "search" else held_out
-        made = tabulate(solver, grid)
-        gaps = [
-            float(jnp.linalg.norm(end(*case, made) - x0) / jnp.linalg.norm(x0))
-            for case, x0 in zip(group, ends[which], strict=True)
-        ]
-        return float(np.mean(gaps))
-
-    grids, records = {}, []
-    for solver in solver_names:
+    jumps, memory = problem.jump_errors()
+    grids: dict[str, dict[str, list[float]]] = {}
+    records = []
+    for solver in names:
         grids[solver] = {}
-        for steps in step_counts:
-            first = flow.optimise_schedule(fine, errors, steps)
+        for budget in BUDGETS:
+            steps = steps_for(solver, budget)
             known = {
-                k: flow.schedule(k, steps, shift=config.flow.shift)
-                for k in ("shift", "uniform", "graded")
+                k: flow.schedule(k, steps, shift=shift) for k in ("shift", "uniform", "graded")
             }
-            start = min([first, *known.values()], key=lambda grid: error(grid, solver))
-            best = flow.refine_schedule(
-                lambda grid, s=solver: error(grid, s), start, rounds=2, trials=4
-            )
-            grids[solver][str(steps)] = [round(float(s), 5) for s in best]
-            known |= {"jumps": first, "optimised": best}
-            record = {name: error(grid, solver, "check") for name, grid in known.items()}
-            records.append({"solver": solver, "steps": steps, "error_on_other_scenes": record})
-            print(json.dumps(records[-1]), flush=True)
+            if steps > 1:
+                known["jumps"] = flow.optimise_schedule(problem.fine, jumps, steps)
+                known["jumps_memory"] = flow.optimise_schedule(problem.fine, memory, steps)
+            errors = {name: problem.error(solver, grid) for name, grid in known.items()}
+            start = min(errors, key=errors.__getitem__)
+            best = flow.refine_schedule(functools.partial(problem.error, solver), known[start])
+            known["optimised"] = best = np.round(best, 5)
+            grids[solver][str(steps)] = best.tolist()
+            record = {
+                "solver": solver,
+                "steps": steps,
+                "evaluations": solvers.nfe(solver, steps),
+                "started_from": start,
+                "searched": errors | {"optimised": problem.error(solver, best)},
+                "other_scenes": {name: check.error(solver, grid) for name, grid in known.items()},
+            }
+            records.append(record)
+            print(solver, steps, start, {k: round(e, 4) for k, e in record["other_scenes"].items()}, flush=True)  # fmt: skip
     return grids, records
 
 
-def main(args):
-    from roge_jax.checkpoint import load_model
-    from roge_jax.video.flow import OPTIMISED_FILE
-
+def main(args: argparse.Namespace) -> None:
+    enable_cache()
+    began = time.perf_counter()
     params, config = load_model(args.checkpoint)
-    cases, held_out = (problems(params, config, seeds) for seeds in (SEARCH, CHECK))
-    grids, records = search(params, config, cases, held_out, args.solvers, args.steps)
-    settings = {
-        "checkpoint": args.checkpoint,
-        "search_seeds": SEARCH,
-        "check_seeds": CHECK,
+    prepare = jax.jit(functools.partial(model.prepare, config=config))
+    problem, check = (
+        Problem(params, config, first, args.scenes, prepare) for first in (SEARCH, CHECK)
+    )
+    grids, records = search(problem, check, args.solvers, config.flow.shift)
+    found = {
+        "command": "python experiments/optimise_schedules.py",
+        "weights": fingerprint(params),
+        "search_seeds": list(range(SEARCH, SEARCH + args.scenes)),
+        "check_seeds": list(range(CHECK, CHECK + args.scenes)),
+        "photos": DEFAULT_M,
         "teacher": f"midpoint, {TEACHER_STEPS} graded steps",
+        "error": "relative L2 of the target latents, mean over scenes",
     }
-    OPTIMISED_FILE.write_text(json.dumps({"settings": settings, "grids": grids}, indent=1) + "\n")
+    table = json.loads(flow.OPTIMISED_FILE.read_text()) if flow.OPTIMISED_FILE.exists() else {}
+    table[config.name] = {"found": found, "grids": grids}
+    flow.OPTIMISED_FILE.write_text(written(table))
     OUT.mkdir(exist_ok=True)
-    report = {"settings": settings, "records": records}
-    (OUT / "optimise_schedules.json").write_text(json.dumps(report, indent=1) + "\n")
+    report = {
+        "settings": found,
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+        "seconds": round(time.perf_counter() - began, 1),
+        "records": records,
+    }
+    short = json.loads(json.dumps(report), parse_float=lambda text: float(f"{float(text):.4g}"))
+    (OUT / "optimise_schedules.json").write_text(json.dumps(short, indent=1) + "\n")
+    print(f"{report['seconds']} s")
+
+
+def written(table: dict[str, Any]) -> str:
+    """JSON with one grid a line: a table that people read."""
+    text = json.dumps(table, indent=1)
+    for entry in table.values():
+        for some in entry["grids"].values():
+            for grid in some.values():
+                long = json.dumps(grid, indent=1).replace("\n", "\n" + " " * 4)
+                text = text.replace(long, json.dumps(grid))
+    return text + "\n"
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="mini")
-    parser.add_argument("--solvers", nargs="+", default=["euler", "unipc_2"])
-    parser.add_argument("--steps", nargs="+", type=int, default=[4, 6, 8])
+    parser.add_argument("--solvers", nargs="+", default=list(SOLVERS), choices=list(SOLVERS))
+    parser.add_argument("--scenes", type=int, default=4, help="of the search, and of the check")
     main(parser.parse_args())

@@ -33,6 +33,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--context", type=int, default=3, help="photos per scene (default: 3)")
     p.add_argument("--steps", type=int, default=20, help="sampling steps (default: 20)")
     p.add_argument("--solver", default="euler", help="sampler (default: euler)")
+    p.add_argument("--schedule", default="shift", help="noise levels of the steps (default: shift)")
     p.add_argument("--seed", type=int, default=0, help="seed of the noise")
     p.add_argument(
         "--sweep", type=float, nargs=2, help="degrees that procedural paths turn, LOW HIGH"
@@ -117,7 +118,9 @@ def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) ->
 class Evaluator:
     """The model's jitted pieces, compiled once for all scenes of a size."""
 
-    def __init__(self, checkpoint: str, solver: str, steps: int, seed: int):
+    def __init__(
+        self, checkpoint: str, solver: str, steps: int, seed: int, schedule: str = "shift"
+    ):
         import functools
 
         import jax
@@ -128,7 +131,10 @@ class Evaluator:
 
         self.params, self.config = load_model(checkpoint)
         config = self.config
-        table = solvers.tabulate(solver, flow.schedule("shift", steps, shift=config.flow.shift))
+        grid = flow.schedule(
+            schedule, steps, shift=config.flow.shift, solver=solver, model=config.name
+        )
+        table = solvers.tabulate(solver, grid)
         self.prepare = jax.jit(functools.partial(model.prepare, config=config))
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
@@ -173,7 +179,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     from .metrics import image, report
     from .metrics.baselines import baselines
 
-    evaluator = Evaluator(args.checkpoint, args.solver, args.steps, args.seed)
+    evaluator = Evaluator(args.checkpoint, args.solver, args.steps, args.seed, args.schedule)
     config = evaluator.config
     size = (config.height, config.width)
     results, rows, methods = [], [], []
@@ -212,6 +218,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "frames": config.frames,
         "solver": args.solver,
         "steps": args.steps,
+        "schedule": args.schedule,
         "seed": args.seed,
         "sweep": args.sweep,
         "metrics": image.SETTINGS,

@@ -338,7 +338,7 @@ def optimise_schedule(sigmas: np.ndarray, errors: np.ndarray, steps: int) -> np.
 
 
 def refine_schedule(
-    error: Callable[[np.ndarray], float], grid: np.ndarray, *, rounds: int = 2, reach: float = 0.4
+    error: Callable[[np.ndarray], float], grid: np.ndarray, *, rounds: int = 2, reach: float = 0.8
 ) -> np.ndarray:
     """Move the inner points of `grid` one by one to where `error(grid)` is least.
 

@@ -1,0 +1,181 @@
+"""Procedural scenes in a batch, and any sampler over all of them at once: shared by the experiments on the trained model.
+
+Every scene is one path of FRAMES + CONTEXTS views; CONTEXTS of them, evenly spread, are photos, the others targets.
+With fewer photos an even choice of the same ones is used, so that curves over M have the same targets, and the noise
+of the target slots is the same for every M. Noise comes from (scene, 0) through NumPy: the same for all samplers.
+"""
+
+import functools
+import hashlib
+import time
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from roge_jax import model
+from roge_jax.config import RoGeConfig
+from roge_jax.data.procedural import sample_sequence
+from roge_jax.data.views import make_sample
+from roge_jax.evaluate import spread
+from roge_jax.video import flow, solvers
+
+CONTEXTS, DEFAULT_M = 6, 3
+ALL_SOLVERS = tuple(name for name, entry in solvers.SOLVERS.items() if entry.method is not None)
+
+
+class Scenes(NamedTuple):
+    """What one model needs of s scenes with m photos each, and what the results are compared with."""
+
+    prepared: model.Prepared  # leading axis s
+    noise: jax.Array  # [s, t, lh, lw, 16]
+    views: dict[str, np.ndarray]  # model inputs, leading axis s
+    truth: np.ndarray  # [s, n, h, w, 3]
+    depth: np.ndarray  # [s, n, h, w], z in the units of c2w
+    K: np.ndarray  # [s, m + n, 3, 3] pixels, photos first
+    c2w: np.ndarray  # [s, m + n, 4, 4] in the scene's frame
+
+    @property
+    def m(self) -> int:
+        return self.views["context_rgb"].shape[1]
+
+
+def render(seeds: Sequence[int], config: RoGeConfig) -> list[dict[str, np.ndarray]]:
+    """The views of every scene at the model's size (its own rendering, not a resize)."""
+    views = config.frames + CONTEXTS
+    size = {"height": config.height, "width": config.width}
+    return [sample_sequence(int(seed), frames=views, **size) for seed in seeds]
+
+
+def photos(frames: int, m: int) -> tuple[list[int], list[int]]:
+    """(photos, targets): views of a path of frames + CONTEXTS; m of the CONTEXTS candidates, evenly spread."""
+    candidates, targets = spread(frames + CONTEXTS, CONTEXTS, frames)
+    return [candidates[int((i + 0.5) * CONTEXTS / m)] for i in range(m)], targets
+
+
+def assemble(
+    params: Any,
+    sequences: Sequence[dict[str, np.ndarray]],
+    config: RoGeConfig,
+    m: int = DEFAULT_M,
+    *,
+    prepare: Any = None,
+) -> Scenes:
+    """`prepare`: a compiled `model.prepare` to reuse."""
+    context, target = photos(config.frames, m)
+    order = context + target
+    samples = [
+        make_sample(
+            s["rgb"][order].astype(np.float32) / 255.0,
+            s["K"][order],
+            s["c2w"][order],
+            m,
+            scale_rule=config.scale_rule,
+        )
+        for s in sequences
+    ]
+    views = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
+    truth = views.pop("target_rgb")
+    prepare = prepare or jax.jit(functools.partial(model.prepare, config=config))
+    each = [prepare(params, {k: v[i] for k, v in views.items()}) for i in range(len(truth))]
+    shape = (*config.latent_size, config.vae.latent)
+    slots = config.slots(m) - m
+    noise = [
+        np.concatenate(
+            [
+                np.random.default_rng([i, 1]).standard_normal((m, *shape), np.float32),
+                np.random.default_rng([i, 0]).standard_normal((slots, *shape), np.float32),
+            ]
+        )
+        for i in range(len(truth))
+    ]
+    return Scenes(
+        jax.tree.map(lambda *x: jnp.stack(x), *each),
+        jnp.asarray(np.stack(noise)),
+        views,
+        truth,
+        np.stack([s["depth"][target] for s in sequences]),
+        np.stack([s["K"][order] for s in sequences]),
+        np.stack([s["c2w"][order] for s in sequences]),
+    )
+
+
+class Run(NamedTuple):
+    latents: jax.Array  # [s, t, lh, lw, 16] of the targets
+    evaluations: int
+    seconds: float  # sampling alone, a scene
+
+
+class Sampler:
+    """All solvers over one batch of scenes; the network is compiled once, whatever the grid."""
+
+    def __init__(self, params: Any, scenes: Scenes, config: RoGeConfig):
+        self.params, self.scenes, self.config = params, scenes, config
+        self._velocity = _compiled(config)
+
+    def velocity(self, x: jax.Array, sigma: jax.Array) -> jax.Array:
+        """[s, t, lh, lw, 16] of all scenes at one noise level."""
+        s = self.scenes
+        return self._velocity(self.params, s.prepared, s.noise, x, jnp.asarray(sigma, jnp.float32))
+
+    def grid(self, schedule: str, steps: int, solver: str) -> np.ndarray:
+        return flow.schedule(
+            schedule, steps, shift=self.config.flow.shift, solver=solver, model=self.config.name
+        )
+
+    def run(self, solver: str, grid: np.ndarray, velocity: Any = None) -> Run:
+        """One fixed-step sampler, of another `velocity(x, sigma)` than the model's if one is given."""
+        began = time.perf_counter()
+        count, end = 0, self.scenes.noise
+        for done, _, x in solvers.iterate(solver, velocity or self.velocity, end, grid):
+            count, end = done, x
+        end = jax.block_until_ready(end)
+        seconds = (time.perf_counter() - began) / len(end)
+        return Run(end[:, self.scenes.m :], count, seconds)
+
+    def adaptive(self, tolerance: float) -> Run:
+        """bosh3; the batch shares its steps."""
+        if not hasattr(self, "_adaptive"):
+
+            @jax.jit
+            def whole(params, prepared, noise, tolerance):
+                def velocity(x, sigma):
+                    return _field(params, prepared, noise, x, sigma, config=self.config)
+
+                ends = np.array([1.0, 0.95, 1e-2, 0.0])
+                return solvers.solve("bosh3", velocity, noise, ends, tolerance=tolerance)
+
+            self._adaptive = whole
+            self.adaptive(1.0)  # compiles
+        s = self.scenes
+        began = time.perf_counter()
+        x, info = jax.block_until_ready(
+            self._adaptive(self.params, s.prepared, s.noise, jnp.float32(tolerance))
+        )
+        seconds = (time.perf_counter() - began) / len(x)
+        solvers.raise_if_failed(info)
+        return Run(x[:, s.m :], int(info.evaluations), seconds)
+
+
+def _field(params, prepared, noise, x, sigma, *, config):
+    def one(prepared, noise, x):
+        field, project = model.sampling_field(params, prepared, noise, config=config)
+        return field(project(x, sigma), sigma)
+
+    return jax.vmap(one)(prepared, noise, x)
+
+
+@functools.cache
+def _compiled(config: RoGeConfig):
+    """One jitted function a config: batches of equal shape share a compilation."""
+    return jax.jit(functools.partial(_field, config=config))
+
+
+def fingerprint(params: Any) -> str:
+    """Twelve hexadecimal digits that change with any weight of the velocity network."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(params["dit"]):
+        digest.update(np.asarray(leaf, np.float32).tobytes())
+    return digest.hexdigest()[:12]
