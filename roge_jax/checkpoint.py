@@ -4,10 +4,13 @@ A model is a folder: `config.json` (the whole configuration and where the weight
 `model-0000i-of-0000n.safetensors` of at most 15 MB, all written under a temporary name and renamed.
 """
 
+import hashlib
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +23,7 @@ from .errors import UserError, did_you_mean
 
 SHARD_BYTES = 15_000_000
 ADAPTER = "adapter.safetensors"
+CHECKSUMS = "sha256.json"  # in a training checkpoint: what each of its files must hash to
 ASSETS = Path(__file__).with_name("assets")
 WEIGHTS_VARIABLE = "ROGE_WEIGHTS"  # a folder with further models, looked up by name
 
@@ -43,6 +47,34 @@ class Checkpoints:
     def save(self, step: int, state: Tree) -> None:
         self._manager.save(step, args=self._ocp.args.StandardSave(state))
         self._manager.wait_until_finished()
+        if jax.process_index() == 0:
+            folder = self.folder / str(step)
+            temporary = folder / f"{CHECKSUMS}.part"
+            temporary.write_text(json.dumps(_checksums(folder), indent=1) + "\n")
+            temporary.replace(folder / CHECKSUMS)
+
+    def verify(self, step: int) -> None:
+        """Raise a UserError if a file of the state of `step` has changed or is gone since it was written.
+
+        Orbax notices damage in its tables, not in the numbers. A state without checksums (the process died before
+        they were written) passes.
+        """
+        folder = self.folder / str(step)
+        if not (folder / CHECKSUMS).exists():
+            return
+        try:
+            want = json.loads((folder / CHECKSUMS).read_text())
+        except ValueError:
+            want = {CHECKSUMS: ""}
+        have = _checksums(folder)
+        wrong = sorted(name for name, digest in want.items() if have.get(name) != digest)
+        if wrong:
+            older = [s for s in self._manager.all_steps() if s < step]
+            cure = f"continue from step {max(older)}" if older else "start again"
+            raise UserError(
+                f"The checkpoint of step {step} in {self.folder} is damaged: {wrong[0]} is not what was written "
+                f"({len(wrong)} of {len(want)} files). Delete {folder} to {cure}."
+            )
 
     def restore(self, like: Tree, step: int | None = None) -> Tree:
         """The state of `step` (default: the latest) with the structure, dtypes and shardings of `like`."""
@@ -62,6 +94,17 @@ class Checkpoints:
 
     def close(self) -> None:
         self._manager.close()
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file below a folder, by relative path, without the list itself."""
+    found = {}
+    for file in sorted(p for p in folder.rglob("*") if p.is_file()):
+        if not file.name.startswith(CHECKSUMS):
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            found[file.relative_to(folder).as_posix()] = digest
+    return found
 
 
 def save_model(
@@ -125,13 +168,19 @@ def find_model(name: str | Path) -> Path:
     raise UserError(f"Unknown checkpoint '{name}': {did_you_mean(str(name), known)}")
 
 
-def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig]:
-    """(params, config) of a model folder or shipped model, checked against the config.
+def load_model(
+    name: str | Path,
+    *,
+    dtype: Any | Callable[[str], Any] = jnp.float32,
+    shardings: Tree | None = None,
+) -> tuple[Tree, RoGeConfig]:
+    """(params, config) of a model folder or shipped model, checked against the config before a value is read.
 
-    Floating leaves come in `dtype`; None: as they are stored.
+    Floating leaves come in `dtype`, which may be a function of the path; None: as they are stored. With `shardings`
+    (a tree as of `core.sharding.shardings`) every device gets its share of a leaf straight from the file; without,
+    leaves are whole. Host memory beside the arrays themselves holds one leaf at a time.
     """
-    from safetensors import SafetensorError
-    from safetensors.flax import load_file
+    from .weights.sources import Source, read_safetensors_header
 
     folder = find_model(name)
     config = load_config(folder)
@@ -148,20 +197,29 @@ def load_model(name: str | Path, *, dtype=jnp.float32) -> tuple[Tree, RoGeConfig
         raise UserError(
             f"{folder} is incomplete: {', '.join(lost)} missing. Copy the whole folder again."
         )
-    flat: dict[str, jax.Array] = {}
+    source = Source(folder, {})
     for file in files:
-        try:
-            flat |= load_file(file)
-        except SafetensorError as error:
-            raise UserError(
-                f"{file} is truncated or not a safetensors file ({error}): copy it again."
-            ) from error
-    if dtype is not None:
-        # In NumPy: JAX would compile a conversion for every shape.
-        flat = {k: jnp.asarray(_cast(np.asarray(v), dtype)) for k, v in flat.items()}
-    params = unflatten(flat)
-    check(params, model.specs(config), source=str(folder))
-    return params, config
+        source.tensors.update(read_safetensors_header(file))
+    check(unflatten(source.tensors), model.specs(config), source=str(folder))
+    where = {} if shardings is None else flatten(shardings)
+    wanted = dtype if callable(dtype) and not isinstance(dtype, type) else lambda path: dtype
+    flat = {
+        path: _placed(source.read(path), wanted(path), where.get(path)) for path in source.tensors
+    }
+    return unflatten(flat), config
+
+
+def _placed(value: np.ndarray, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
+    """A leaf of a file on its devices. Conversion is NumPy's: JAX would compile one for every shape."""
+    kept = dtype is None or not jnp.issubdtype(value.dtype, jnp.floating)
+    wanted = value.dtype if kept else jnp.dtype(dtype)
+
+    def share(index) -> np.ndarray:
+        return np.array(value[index], wanted)  # a copy: the file may change while the array lives
+
+    if sharding is None:
+        return jnp.asarray(share(...))
+    return jax.make_array_from_callback(value.shape, sharding, share)
 
 
 def save_adapter(
@@ -248,10 +306,6 @@ def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
     a, b = (shape, other) if leaf == "lora_a" else (other, shape)
     head, rank = kernel.shape[:lead], a[-1]
     return a == (*head, int(np.prod(ins)), rank) and b == (*head, rank, d_out)
-
-
-def _cast(x: np.ndarray, dtype) -> np.ndarray:
-    return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
 
 def load_config(folder: Path) -> RoGeConfig:

@@ -18,10 +18,7 @@ from .core.params import flatten
 from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
 from .video.dit import FLOAT32_LEAVES
-
-SINGLE_PASS_BYTES = (
-    2e9  # a VAE decoder whose largest tensor is above this works one latent frame at a time
-)
+from .video.vae import SINGLE_PASS_BYTES, largest_map
 
 
 def attention(queries: int, keys: int, width: int) -> float:
@@ -207,7 +204,8 @@ def vae_decode(
 
 def decoder_tensor_bytes(config: RoGeConfig, frames: int | None = None) -> float:
     """The decoder's largest tensor, float32: a feature map of the last stage, at full size."""
-    return 4.0 * (frames or config.frames) * config.height * config.width * _widths(config.vae)[0]
+    shape = (frames or config.frames, config.height, config.width)
+    return largest_map(shape, config.vae)
 
 
 # Maps of full size alive at once in a residual block: its input, that activated, and of the convolution the sum over

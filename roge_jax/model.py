@@ -175,8 +175,10 @@ def encode_contexts(params: Tree, context_rgb: jax.Array, *, config: RoGeConfig)
 
 @jax.named_scope("vae")
 def encode_targets(params: Tree, target_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
-    """X^T [1 + (n - 1) / 4, lh, lw, 16]: the target video through the causal VAE."""
-    return vae.encode(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
+    """X^T [1 + (n - 1) / 4, lh, lw, 16]: the target video through the causal VAE, in chunks of time if it is large."""
+    large = vae.largest_map(target_rgb.shape, config.vae) > vae.SINGLE_PASS_BYTES
+    encode = vae.encode_chunked if large else vae.encode
+    return encode(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
 
 
 @jax.named_scope("vae")

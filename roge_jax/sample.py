@@ -78,6 +78,9 @@ def parser() -> argparse.ArgumentParser:
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)
     option("--fps", "frames per second", 16.0, type=number(1e-3, whole=False))
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
+    mesh_help = "how to split the work over devices, e.g. fsdp=2,seq=2: weights; tokens and views (one device if not given)"
+    option("--mesh", mesh_help)
+    option("--devices", "how many devices to use; those of --mesh", type=number(1))
     p.add_argument(
         "--dry-run", action="store_true", help="print tokens, FLOPs and memory, and stop"
     )
@@ -194,25 +197,39 @@ def large_dtype(args: argparse.Namespace, parameters: float) -> str:
     return "bfloat16" if parameters > LARGE and jax.default_backend() != "cpu" else "float32"
 
 
-def load_weights(args: argparse.Namespace):
-    """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
-    import jax.numpy as jnp
+def sampling_mesh(args: argparse.Namespace):
+    """The mesh of --mesh and --devices, None for one device. Call it before anything asks JAX for devices."""
+    from .core import distributed, sharding
 
-    from . import checkpoint, cost, model
-    from .core.params import count, flatten, unflatten
-
-    config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
-    dtype = large_dtype(args, count(model.specs(config)))
-    params, config = checkpoint.load_model(args.checkpoint, dtype=jnp.dtype(dtype))
-    if dtype == "bfloat16":
-        flat = flatten(params)
-        params = unflatten(
-            {
-                path: leaf.astype(jnp.float32) if cost.keeps_float32(path) else leaf
-                for path, leaf in flat.items()
-            }
+    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    if sizes.get("data", 1) > 1:
+        raise UserError(
+            f"--mesh {args.mesh}: one video has no scenes to split over data: use fsdp (weights) and seq (tokens)."
         )
-    return params, config
+    count = args.devices or sizes.get("fsdp", 1) * sizes.get("seq", 1)
+    if count == 1:
+        return None
+    distributed.request_devices(count)
+    import jax
+
+    devices = jax.devices()[:count]
+    sizes = sizes or {"seq": len(devices)}
+    return sharding.make_mesh(**{"data": 1} | sizes, devices=devices)
+
+
+def load_weights(args: argparse.Namespace, mesh=None):
+    """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+    from . import checkpoint, cost, model
+    from .core import sharding
+    from .core.params import count
+
+    specs = model.specs(checkpoint.load_config(checkpoint.find_model(args.checkpoint)))
+    dtype = large_dtype(args, count(specs))
+    return checkpoint.load_model(
+        args.checkpoint,
+        dtype=lambda path: "float32" if cost.keeps_float32(path) else dtype,
+        shardings=None if mesh is None else sharding.shardings(specs, mesh),
+    )
 
 
 # ---- outputs -------------------------------------------------------------------------------------
@@ -295,6 +312,7 @@ def main(args: argparse.Namespace) -> None:
     import warnings
 
     from . import sampling
+    from .core import sharding
 
     settings = sampling.Settings(
         steps=args.steps,
@@ -310,15 +328,15 @@ def main(args: argparse.Namespace) -> None:
     from .data.scene import load_scene
 
     clock = Clock()
-    config = model_config(args, weights=True)
-    with output_folder(args.out) as folder:
+    config, mesh = model_config(args, weights=True), sampling_mesh(args)
+    with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
             scene = load_scene(args.scene)
             photos = sampling.read_photos(
                 scene, context_ids(args.context, scene, config.max_context), config
             )
             path = camera_path(args, photos.cameras, config)
-            params, _ = load_weights(args)
+            params, _ = load_weights(args, mesh)
         print(
             f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
         )

@@ -24,6 +24,7 @@ import numpy as np
 
 from . import cost, limits, model
 from .config import RoGeConfig
+from .core import sharding
 from .core.params import Tree
 from .data.scene import Scene, distinct_views
 from .data.scene import prepare as prepare_photos
@@ -204,23 +205,24 @@ def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.
 def programs(
     params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots
 ) -> Programs:
-    """Compile all pieces for the shapes of `views`, side by side: compiling is what a short run waits for."""
-    m = views["context_rgb"].shape[0]
-    fix = functools.partial
+    """Compile all pieces for the shapes of `views`, side by side: compiling is what a short run waits for.
+
+    On a mesh (`core.sharding.use`) weights stay where they lie; all else goes in and comes out whole.
+    """
+    m, whole = views["context_rgb"].shape[0], sharding.everywhere()
+    fix, jit = functools.partial, functools.partial(jax.jit, out_shardings=whole)
     pieces = {
-        "prepare": jax.jit(fix(model.prepare, config=config)),
-        "velocity": jax.jit(fix(velocity, config=config, slots=slots)),
-        "decode": jax.jit(fix(decode, config=config, contexts=m)),
-        "preview": jax.jit(lambda p, features: model.decode_rgb(p, features[m:], config=config)),
+        "prepare": jit(fix(model.prepare, config=config)),
+        "velocity": jit(fix(velocity, config=config, slots=slots)),
+        "decode": jit(fix(decode, config=config, contexts=m)),
+        "preview": jit(lambda p, features: model.decode_rgb(p, features[m:], config=config)),
     }
 
-    def shapes(tree):
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), tree)
-
+    shapes = sharding.shapes
     weights, seen = shapes(params), shapes(views)
-    prepared = jax.eval_shape(pieces["prepare"], weights, seen)
+    prepared = shapes(jax.eval_shape(pieces["prepare"], weights, seen))
     state = shapes(draw_noise(0, 0, m, config))
-    sigma = jax.ShapeDtypeStruct((), jnp.float32)
+    sigma = jax.ShapeDtypeStruct((), jnp.float32, sharding=whole)
     arguments = {
         "prepare": (weights, seen),
         "velocity": (weights, prepared, state, state, sigma),
@@ -353,8 +355,9 @@ def sample(
         full = sum(chained(given, config)) if number and settings.long == "chain" else given
         with stage("prepare"):
             prepared = jax.block_until_ready(run.prepare(params, views))
-            noise = jnp.asarray(
-                draw_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :]
+            noise = jax.device_put(
+                draw_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :],
+                sharding.everywhere(),
             )
         with stage("sample"):
             x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)

@@ -14,7 +14,6 @@ import contextlib
 import dataclasses
 import functools
 import math
-import os
 from pathlib import Path
 
 RECIPES = ("lora", "hires", "all")
@@ -132,12 +131,7 @@ def main(args: argparse.Namespace) -> None:
     if args.dry_run:
         return print(dry_run(args))
     sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
-    wanted = args.devices or math.prod(sizes.values())
-    if wanted > 1 and not distributed.launch_arguments(os.environ):
-        # A CPU shows as many devices as it is asked for; other platforms ignore the flag.
-        os.environ["XLA_FLAGS"] = (
-            f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={wanted}"
-        )
+    distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
 
     distributed.maybe_initialise_distributed()

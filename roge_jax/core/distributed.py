@@ -67,6 +67,13 @@ def launch_arguments(environment: Mapping[str, str]) -> dict[str, Any] | None:
     return None
 
 
+def request_devices(count: int) -> None:
+    """Have a CPU show `count` devices, before JAX looks for any; other platforms ignore the flag."""
+    if count > 1 and not launch_arguments(os.environ):
+        flag = f"--xla_force_host_platform_device_count={count}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
+
+
 def maybe_initialise_distributed() -> int:
     """Join the other processes of this run, if the environment says that there are any; the number of processes.
 

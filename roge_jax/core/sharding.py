@@ -272,6 +272,23 @@ def ways(axis: str) -> int:
     return 1 if mesh is None else mesh.shape[axis]
 
 
+def everywhere() -> NamedSharding | None:
+    """Whole on every device of the current mesh; None without a mesh."""
+    mesh = current()
+    return None if mesh is None else replicated(mesh)
+
+
+def shapes(tree: Any) -> Any:
+    """Abstract arrays of `tree`. On a mesh they lie where the arrays do, and whole everywhere if those lie on none."""
+
+    def leaf(x):
+        where = getattr(x, "sharding", None)
+        where = where if isinstance(where, NamedSharding) else everywhere()
+        return jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=where)
+
+    return jax.tree.map(leaf, tree)
+
+
 def constrain(x: jax.Array, names: Sequence[str | None]) -> jax.Array:
     """x, laid out as the table says for logical axes `names`; None: whole on every device. No-op without a mesh.
 

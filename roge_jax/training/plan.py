@@ -155,9 +155,9 @@ def plan(
         share = (
             sizes["seq"] if name in split else 1
         )  # what `seq` does not split, its devices repeat
-        row = work.setdefault(PARTS.get(name, "optimiser"), dict.fromkeys(PASSES, 0.0))
+        row = work.setdefault(PARTS.get(name, "the rest"), dict.fromkeys(PASSES, 0.0))
         row[kind] += value / share
-    order = [*PARTS.values(), "optimiser"]
+    order = [*PARTS.values(), "the rest"]
     by_part: dict[str, float] = {}
     for held in peak.held:
         name = f"{PARTS.get(part(held.scope), 'the rest')}, {which_pass(held.scope)}"

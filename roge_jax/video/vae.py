@@ -24,6 +24,7 @@ from ..core.params import Spec, Tree, fan_in, zeros
 from ..errors import UserError
 
 SPACE, TIME = 8, 4  # compression
+SINGLE_PASS_BYTES = 2e9  # a clip whose largest feature map is above this goes through in chunks
 Past = (
     dict | None
 )  # what earlier chunks leave behind, shaped like the network; None: there are none
@@ -331,6 +332,11 @@ def encode_frames(p: Tree, frames: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 def decode_frames(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """Latents of unrelated images [n, lh, lw, c] -> images [n, 8 lh, 8 lw, 3]."""
     return jax.vmap(lambda z: decode(p, z[None], cfg=cfg)[0])(latents)
+
+
+def largest_map(shape: tuple[int, ...], cfg: VAEConfig) -> float:
+    """Bytes of the largest feature map of a clip [t, h, w, 3]; several of them live at once."""
+    return 4.0 * float(np.prod(shape[:3])) * cfg.base
 
 
 def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:

@@ -1,0 +1,114 @@
+"""One video on many devices is the video of one device; weights go from the file straight to where they lie."""
+
+import dataclasses
+import tracemalloc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_sharding import drawn, small
+
+from roge_jax import model, sample, sampling
+from roge_jax.checkpoint import find_model, load_config, load_model, save_model
+from roge_jax.core import sharding
+from roge_jax.core.params import abstract, flatten
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import Cameras
+
+
+def cameras(n: int, cfg, step: float) -> Cameras:
+    K = np.array([[40.0, 0, cfg.width / 2], [0, 40.0, cfg.height / 2], [0, 0, 1]])
+    c2w = np.tile(np.eye(4), (n, 1, 1))
+    c2w[:, 0, 3] = step * np.arange(n)
+    return Cameras(np.tile(K, (n, 1, 1)), c2w)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    cfg = dataclasses.replace(small(), frames=1)
+    folder = tmp_path_factory.mktemp("model") / "m"
+    save_model(folder, drawn(model.specs(cfg), 1), cfg, dtype=jnp.float32)
+    return folder, cfg
+
+
+def test_sampling_on_a_mesh_equals_one_device(saved):
+    """fsdp=2, seq=2: weights loaded in shares, tokens and views split; frames and preview to rounding."""
+    folder, cfg = saved
+    photos = sampling.Photos(
+        np.random.default_rng(0).random((2, cfg.height, cfg.width, 3), np.float32),
+        None,
+        cameras(2, cfg, 1.0),
+        (0, 1),
+    )
+    path, settings = cameras(1, cfg, 0.2), sampling.Settings(steps=2, solver="euler")
+
+    def run(mesh):
+        where = None if mesh is None else sharding.shardings(model.specs(cfg), mesh)
+        params, _ = load_model(folder, shardings=where)
+        with sharding.use(mesh):
+            result = sampling.sample(params, cfg, photos, path, settings)
+        return result.frames, result.preview
+
+    one = run(None)
+    four = run(sharding.make_mesh(1, 2, 2, devices=jax.devices()[:4]))
+    for a, b in zip(one, four):
+        assert a.std() > 1e-3, "a picture, not a constant"
+        np.testing.assert_allclose(b, a, atol=2e-5)
+
+
+class TestLoading:
+    def test_every_leaf_arrives_where_it_belongs(self, saved):
+        folder, cfg = saved
+        mesh, specs = sharding.make_mesh(1, 4, 2), model.specs(cfg)
+        where = flatten(sharding.shardings(specs, mesh))
+        whole, _ = load_model(folder)
+        shared, _ = load_model(folder, shardings=sharding.shardings(specs, mesh))
+        assert any(not s.is_fully_replicated for s in where.values())
+        for name, x in flatten(shared).items():
+            assert x.sharding == where[name], name
+            np.testing.assert_array_equal(np.asarray(x), flatten(whole)[name])
+
+    def test_types(self, saved):
+        folder, _ = saved
+        half, _ = load_model(folder, dtype=lambda p: "float32" if "norm" in p else "bfloat16")
+        for name, x in flatten(half).items():
+            assert x.dtype == (jnp.float32 if "norm" in name else jnp.bfloat16), name
+        assert {x.dtype for x in jax.tree.leaves(load_model(folder, dtype=None)[0])} == {
+            np.dtype(np.float32)
+        }
+
+    def test_host_memory_holds_one_leaf(self):
+        """NumPy's memory at its fullest while the shipped model loads: its largest leaf and headers, not the model."""
+        mesh, config = sharding.make_mesh(1, 4, 2), load_config(find_model("mini"))
+        where = sharding.shardings(model.specs(config), mesh)
+        sizes = [4 * x.size for x in jax.tree.leaves(abstract(model.specs(config)))]
+        tracemalloc.start()
+        load_model("mini", shardings=where)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert max(sizes) / 2 < peak < max(sizes) + 2e6 < sum(sizes) / 4
+
+    def test_a_misshapen_model_is_refused_before_it_is_read(self, saved, tmp_path):
+        _, cfg = saved
+        wrong = drawn(model.specs(cfg), 1)
+        wrong["dit"]["patch_embed"]["bias"] = np.zeros(3, np.float32)
+        save_model(tmp_path / "w", wrong, cfg)
+        with pytest.raises(UserError, match="patch_embed/bias has shape"):
+            load_model(tmp_path / "w")
+
+
+class TestFlags:
+    def mesh(self, *words):
+        return sample.sampling_mesh(sample.parser().parse_args(list(words)))
+
+    def test_meshes(self):
+        assert self.mesh() is None
+        assert dict(self.mesh("--mesh", "fsdp=2,seq=2").shape) == {"data": 1, "fsdp": 2, "seq": 2}
+        assert dict(self.mesh("--devices", "4").shape) == {"data": 1, "fsdp": 1, "seq": 4}
+
+    def test_mistakes(self):
+        with pytest.raises(UserError, match="no scenes to split over data"):
+            self.mesh("--mesh", "data=2,seq=2")
+        with pytest.raises(UserError, match="does not make 4 devices"):
+            self.mesh("--mesh", "fsdp=3", "--devices", "4")
