@@ -16,11 +16,35 @@ from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import make_path
 from roge_jax.planning import coverage, proxies, table
-from roge_jax.planning.plan import full_choices
+from roge_jax.planning.options import full_choices, list_options
 from roge_jax.recon.ray_scene import attend, merge_scene
 
 CONFIG = preset("tiny")
 SETTINGS = sampling.Settings(steps=12)
+# Made-up constants, so that no test depends on how the shipped model was measured.
+TABLE = table.parse(
+    "tiny",
+    {
+        "steps": [
+            {"solver": "unipc_2", "schedule": "shift", "steps": k, "evaluations": k, "error": e}
+            for k, e in ((2, 0.06), (3, 0.04), (4, 0.025), (6, 0.012), (8, 0.006))
+        ],
+        **{"photos": 0.1, "photos_floor": 0.01, "photos_head": 0.1, "photos_floor_head": 0.01},
+        **{"merge": {2: 0.01, 4: 0.02}, "merge_head": {2: 0.01, 4: 0.02}},
+        **{"half": 0.03, "half_head": 0.04, "head": 0.08},
+        "knobs": {
+            "photos": [{"proxy": "leave_one_out", "typical": 0.1, "power": 1.0}],
+            "steps": [
+                {"proxy": "richardson", "typical": 0.1, "power": 1.0},
+                {"proxy": "detail", "typical": 0.05, "power": 1.0},
+            ],
+            "merge": [{"proxy": "redundancy", "typical": 0.3, "power": 1.0}],
+            "half": [],
+            "head": [{"proxy": "detail", "typical": 0.05, "power": 0.5}],
+        },
+        "provenance": {},
+    },
+)
 TOLERANCES = (0.0, 1e-4, 0.003, 0.01, 0.02, 0.03, 0.05, 0.08, 0.13, 0.2, 0.5)
 
 
@@ -64,7 +88,7 @@ def compiled():
 @pytest.fixture(scope="module")
 def make(weights, photos, path, compiled):
     def plan(tolerance, **options):
-        options = {"settings": SETTINGS, "compiled": compiled} | options
+        options = {"settings": SETTINGS, "compiled": compiled, "table": TABLE} | options
         return rj.plan(
             weights,
             CONFIG,
@@ -171,7 +195,8 @@ def test_explain_tells_what_was_bought_and_what_was_not(make):
     assert text.count("bought") == len(plan.bought) - 1 and "start" in text
     assert ("refused" in text) == (plan.refused is not None)
     assert f"predicted error {plan.predicted_error:.4f}" in text
-    assert "for 'mini', not for 'tiny'" in text  # the table is another model's
+    assert "not for 'tiny'" not in text
+    assert "for 'mini', not for 'tiny'" in make(0.05, table=None, probe=0.0).explain()
 
 
 def test_prices_are_those_of_the_cost_model(make):
@@ -228,6 +253,19 @@ def test_coverage_knows_no_unit_and_no_frame(photos, path):
         np.mean(np.abs(here - there) > 1e-6) < 0.002
     )  # points on a picture's border may fall either way
     assert here.min() >= 0 and here.max() <= 1 and here.mean() > 0.05
+
+
+def test_the_window_that_is_seen_best_is_the_one_not_generated(photos):
+    """The photos' own views against views turned away from all that they show."""
+    away = photos.cameras.c2w.copy()
+    away[:, :3, :3] = away[:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])
+    order = [0, 1, 2, 3, 3]
+    for turned, parts in enumerate(((away, photos.cameras.c2w), (photos.cameras.c2w, away))):
+        path = Cameras(photos.cameras.K[order * 2], np.concatenate([p[order] for p in parts]))
+        worth = coverage.coverage(photos.cameras, path, CONFIG.height, CONFIG.width)
+        listed = list_options(photos, CONFIG, path, SETTINGS, TABLE, {}, worth)
+        mixed = [o.choices.generate for o in listed if sum(o.choices.generate) == 1]
+        assert mixed and all(generate[turned] for generate in mixed)
 
 
 def test_one_photo_can_be_planned_for(make, photos):

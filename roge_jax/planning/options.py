@@ -56,9 +56,10 @@ def list_options(
 ) -> list[Option]:
     """All combinations of the knobs with predicted errors and FLOPs; the full model alone if `worth` is None."""
     full = full_choices(photos, config, path, settings)
-    spans = np.diff(windows(len(path), config.frames), axis=1)[:, 0] / len(path)
+    parts = windows(len(path), config.frames)
+    spans = np.array([stop - start for start, stop in parts]) / len(path)
     evaluations = _evaluations(settings)
-    price = _Prices(photos, config, settings, len(spans))
+    price = Prices(photos, config, settings, len(spans))
     options = [Option(full, 0.0, price(full, evaluations))]
     if worth is None:
         return options
@@ -73,6 +74,9 @@ def list_options(
     merges = [(m, table.merge.get(m, 0.0), table.merge_head.get(m, 0.0)) for m in MERGES]
     if full.merge != 1:
         merges = [(full.merge, 0.0, 0.0)]
+    # Where little is seen there is most to make up: those windows are generated first.
+    first = np.argsort([seen(photos, path[a:b], config) for a, b in parts], kind="stable")
+    rank = np.argsort(first)
     for (kept, lost), (merge, *e_merge), (size, *e_size) in itertools.product(
         _photo_sets(worth), merges, sizes
     ):
@@ -96,7 +100,7 @@ def list_options(
             for generated in range(len(spans) + 1):
                 if generated == 0 and count != full.steps:
                     continue  # no steps are taken: one entry is enough
-                squares = np.where(np.arange(len(spans)) < generated, made**2, head**2)
+                squares = np.where(rank < generated, made**2, head**2)
                 choices = Choices(
                     kept,
                     count,
@@ -104,12 +108,18 @@ def list_options(
                     schedule,
                     size,
                     merge,
-                    (True,) * generated + (False,) * (len(spans) - generated),
+                    tuple(bool(r < generated) for r in rank),
                 )
                 error = float(np.sqrt((squares * spans).sum()))
                 if choices != full:
                     options.append(Option(choices, error, price(choices, cost_steps)))
     return options
+
+
+def seen(photos: Photos, path: Cameras, config: RoGeConfig) -> float:
+    """Coverage of a part of the path by all photos."""
+    worth = coverage.coverage(photos.cameras, path, config.height, config.width)
+    return coverage.covered(worth, tuple(range(len(worth))))
 
 
 def _photo_sets(worth: np.ndarray) -> list[tuple[tuple[int, ...], float | None]]:
@@ -132,7 +142,7 @@ def _evaluations(settings: Settings) -> int:
     return solvers.nfe(settings.solver, settings.steps)
 
 
-class _Prices:
+class Prices:
     """FLOPs of a run under choices."""
 
     def __init__(self, photos: Photos, config: RoGeConfig, settings: Settings, windows: int):

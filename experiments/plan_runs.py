@@ -1,0 +1,324 @@
+"""What `plan_ladder.py` runs on: scenes of known complexity, one engine for all plans, the planner's calibration."""
+
+import dataclasses
+import functools
+import zlib
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from roge_jax import evaluate, model, sampling
+from roge_jax.data import procedural
+from roge_jax.data.raycast import OBJECTS, ROOM, render_views
+from roge_jax.geometry.cameras import Cameras, normalise
+from roge_jax.planning import coverage, proxies
+from roge_jax.planning.options import MERGES, full_choices
+from roge_jax.video import flow
+from roge_jax.windows import window_views
+
+CONTEXTS = 6
+RUNGS = ("plane", "empty", "3 objects", "6 objects", "12 objects", "clutter")
+KEPT = {"plane": (), "empty": (), "3 objects": (2, 6, 9), "6 objects": (2, 3, 6, 7, 9, 10)}
+
+
+# ---- scenes ----------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass
+class LadderScene:
+    """Six photos and 17 targets between them, of one camera path. `truth` [n, h, w, 3]; bits per pixel of the photos."""
+
+    rung: str
+    seed: int
+    photos: sampling.Photos
+    path: Cameras
+    truth: np.ndarray
+    bits: float
+    kept: dict = dataclasses.field(default_factory=dict)  # what the engine need not compute twice
+
+
+@functools.partial(jax.jit, static_argnames=("frames", "height", "width"))
+def _render(seed, textures, keep, plane, gather, *, frames, height, width):
+    scene = procedural.make_scene(seed, textures=textures)
+    dense = procedural.camera_path(seed, 64, scene=scene)["c2w"]
+    path = procedural.camera_path(seed, frames, scene=scene)
+    # Clutter: everything around the focus, thinner and taller, so that things hide one another.
+    inward = scene.focus[None, :2] + 0.45 * (scene.centre[2:OBJECTS, :2] - scene.focus[None, :2])
+    thin = scene.half[2:OBJECTS] * jnp.array([[0.7, 0.7, 1.4]])
+    rise = scene.centre[2:OBJECTS, 2] + thin[:, 2] - scene.half[2:OBJECTS, 2]
+    moved = jnp.concatenate([inward, rise[:, None]], -1)
+    centre = scene.centre.at[2:OBJECTS].set(jnp.where(gather, moved, scene.centre[2:OBJECTS]))
+    half = scene.half.at[2:OBJECTS].set(jnp.where(gather, thin, scene.half[2:OBJECTS]))
+    scene = procedural.clear_views(dataclasses.replace(scene, centre=centre, half=half), dense)
+    centre, half, rotation = scene.centre, scene.half, scene.rotation
+    sunk = -2.0 - jnp.linalg.norm(half[:OBJECTS], axis=-1)
+    centre = centre.at[:OBJECTS, 2].set(jnp.where(keep, centre[:OBJECTS, 2], sunk))
+    # Plane: object 0 becomes a wall behind the focus that fills every view, in a room too large to be seen.
+    ahead = (scene.focus - dense[:, :3, 3].mean(0)).at[2].set(0.0)
+    ahead = ahead / jnp.linalg.norm(ahead)
+    c, s, zero, one = ahead[0], ahead[1], 0.0 * ahead[0], 1.0 + 0.0 * ahead[0]
+    turn = jnp.stack([c, -s, zero, s, c, zero, zero, zero, one]).reshape(3, 3)
+    wall = scene.focus + 0.7 * ahead
+    centre = centre.at[0].set(jnp.where(plane, wall, centre[0]))
+    half = half.at[0].set(jnp.where(plane, jnp.array([0.02, 15.0, 15.0]), half[0]))
+    rotation = rotation.at[0].set(jnp.where(plane, turn, rotation[0]))
+    centre = centre.at[ROOM].set(jnp.where(plane, jnp.zeros(3), centre[ROOM]))
+    half = half.at[ROOM].set(jnp.where(plane, jnp.full(3, 40.0), half[ROOM]))
+    scene = dataclasses.replace(scene, centre=centre, half=half, rotation=rotation)
+    K = procedural.intrinsics(path["fov"], height, width)
+    Ks = jnp.broadcast_to(K[None], (frames, 3, 3))
+    rgb = render_views(scene, Ks, path["c2w"], height=height, width=width, supersample=2)["rgb"]
+    return rgb, Ks, path["c2w"]
+
+
+def make(rung: str, seed: int, config) -> LadderScene:
+    """One scene of the ladder: the same seed has the same cameras and textures on every rung."""
+    textures = procedural._device_textures(procedural.split_of(seed))
+    keep = np.isin(np.arange(OBJECTS), KEPT.get(rung, range(OBJECTS)))
+    rgb, K, c2w = _render(
+        np.int32(seed),
+        textures,
+        keep,
+        rung == "plane",
+        rung == "clutter",
+        frames=config.frames + CONTEXTS,
+        height=config.height,
+        width=config.width,
+    )
+    rgb = np.round(np.asarray(rgb) * 255).astype(np.uint8)
+    K, c2w = np.asarray(K, np.float64), np.asarray(c2w, np.float64)
+    context, target = evaluate.spread(len(rgb), CONTEXTS, config.frames)
+    steps = np.diff(rgb[context].astype(np.int16), axis=2).astype(np.int8)  # lossless, along rows
+    bits = 8 * len(zlib.compress(steps.tobytes(), 9)) / (steps.size / 3)
+    photos = sampling.Photos(
+        rgb[context].astype(np.float32) / 255.0,
+        None,
+        Cameras(K[context], c2w[context]),
+        tuple(range(CONTEXTS)),
+    )
+    truth = rgb[target].astype(np.float32) / 255.0
+    return LadderScene(rung, seed, photos, Cameras(K[target], c2w[target]), truth, bits)
+
+
+# ---- runs ------------------------------------------------------------------------------------------
+
+
+class Engine:
+    """`sampling.sample` for one window, in pieces: what two plans of a scene share is computed and compiled once.
+
+    FLOPs are counted by `roge_jax.cost` for each plan as if it ran alone.
+    """
+
+    def __init__(self, params, config):
+        self.params, self.config = params, config
+        self.settings = sampling.Settings()
+        self.programs: dict = {}
+        self.velocity = jax.jit(functools.partial(sampling.velocity, config=config, slots="noised"))
+        self.decode = jax.jit(functools.partial(sampling.decode, config=config, contexts=0))
+        self.encode = jax.jit(functools.partial(model.encode_contexts, config=config))
+
+    def program(self, f, config):
+        return self.programs.setdefault((f, config), jax.jit(functools.partial(f, config=config)))
+
+    def choices(self, scene: LadderScene, **changes) -> sampling.Choices:
+        full = full_choices(scene.photos, self.config, scene.path, self.settings)
+        return dataclasses.replace(full, **changes)
+
+    def features(self, scene: LadderScene, choices):
+        """(views, ray features) under choices of photos, size and tokens."""
+        photos, config, _ = sampling.reduced(scene.photos, self.config, self.settings, choices)
+        seen = ("views", choices.photos)
+        if seen not in scene.kept:
+            context, target, info = normalise(
+                photos.cameras, scene.path, rule=config.scale_rule, scale=None
+            )
+            scene.kept[seen] = window_views(photos.images, None, context, target, info, config)
+        views = scene.kept[seen]
+        plain = dataclasses.replace(config, renderer=dataclasses.replace(config.renderer, merge=1))
+        tokens, rays = (seen[1], choices.recon), (seen[1], choices.recon, choices.merge)
+        if tokens not in scene.kept:
+            scene.kept[tokens] = self.program(model.reconstruct, plain)(self.params, views)
+        if rays not in scene.kept:
+            query = self.program(model.query_rays, config)
+            scene.kept[rays] = query(self.params, scene.kept[tokens], views)
+        return views, scene.kept[rays]
+
+    def run(self, scene: LadderScene, choices) -> np.ndarray:
+        """The frames [n, h, w, 3] under `choices`."""
+        if choices in scene.kept:
+            return scene.kept[choices]
+        m, config = len(choices.photos), self.config
+        views, features = self.features(scene, choices)
+        if not choices.generate[0]:
+            head = self.program(model.decode_rgb, config)(self.params, features[m:])
+            frames = np.asarray(model.resized(head, config.height, config.width))
+        else:
+            frames = np.asarray(
+                self.decode(self.params, self.latents(scene, choices, views, features))
+            )
+        scene.kept[choices] = frames
+        return frames
+
+    def latents(self, scene, choices, views, features) -> jax.Array:
+        m = len(choices.photos)
+        if "latents" not in scene.kept:
+            scene.kept["latents"] = self.encode(self.params, scene.photos.images)
+        known = scene.kept["latents"][np.array(choices.photos)]
+        cond = self.program(model.condition, self.config)(self.params, known, features, views)
+        prepared = model.Prepared(known, jnp.zeros(()), cond, None)
+        noise = sampling.draw_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
+        settings = dataclasses.replace(
+            self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
+        )
+        grid = flow.schedule(
+            settings.schedule,
+            settings.steps,
+            shift=self.config.flow.shift,
+            solver=settings.solver,
+        )
+        run, bar = SimpleNamespace(velocity=self.velocity), SimpleNamespace(update=lambda n: None)
+        x0, _ = sampling.integrate(
+            run, self.params, prepared, jnp.asarray(noise), grid, settings, self.config, bar
+        )
+        return x0[m:]
+
+
+def rms(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.sqrt(np.square(a - b).mean(dtype=np.float64)))
+
+
+# ---- calibration -----------------------------------------------------------------------------------
+
+WAYS = [("unipc_2", "shift", k) for k in (2, 3, 4, 6, 8)]
+WAYS += [("ab2", "shift", 2), ("ab2", "shift", 4), ("unipc_2", "uniform", 4)]
+BASE = {
+    "steps": 4
+}  # at which photos, tokens and size are compared: their effect, not that of few steps
+
+
+def stored_ways() -> list[tuple[str, str, int]]:
+    """Optimised schedules of one evaluation per step, where they are stored."""
+    import json
+
+    if not flow.OPTIMISED_FILE.exists():
+        return []
+    grids = json.loads(flow.OPTIMISED_FILE.read_text()).get("grids", {})
+    return [
+        (solver, "optimised", int(k))
+        for solver in ("unipc_2", "ab2", "euler", "dpmpp_2m")
+        for k in grids.get(solver, {})
+        if int(k) <= 8
+    ]
+
+
+def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
+    """Errors of one knob at a time on one scene, and its proxies."""
+    full = engine.choices(scene)
+    reference = engine.run(scene, full)
+    base = dataclasses.replace(full, **BASE)
+    head = dataclasses.replace(full, generate=(False,))
+    small = proxies.half_size(engine.config)
+
+    def both(**changes):
+        return [
+            rms(engine.run(scene, dataclasses.replace(a, **changes)), engine.run(scene, a))
+            for a in (base, head)
+        ]
+
+    row = {"rung": scene.rung, "seed": scene.seed, "bits": scene.bits}
+    row["full_to_truth"] = rms(reference, scene.truth)
+    row["head_to_truth"] = rms(engine.run(scene, head), scene.truth)
+    row["head"] = rms(engine.run(scene, head), reference)
+    row["steps"] = [
+        [*way, rms(engine.run(scene, dataclasses.replace(full, solver=way[0], schedule=way[1], steps=way[2])), reference)]
+        for way in [*WAYS, *stored_ways()]
+    ]  # fmt: skip
+    row["merge"] = {merge: both(merge=merge) for merge in MERGES[1:]}
+    row["half"] = both(recon=(small.recon_height, small.recon_width))
+    size = (engine.config.height, engine.config.width)
+    worth = coverage.coverage(scene.photos.cameras, scene.path, *size)
+    order = [photo for photo, _ in coverage.greedy(worth)]
+    best = coverage.covered(worth, full.photos)
+    rng = np.random.default_rng(scene.seed)
+    sets = [order[:k] for k in (1, 2, 4)] + [rng.permutation(CONTEXTS)[:k].tolist() for k in (1, 2)]
+    row["photos"] = [
+        [sorted(kept), 1 - coverage.covered(worth, tuple(kept)) / best, *both(photos=tuple(sorted(kept)))]
+        for kept in sets
+    ]  # fmt: skip
+    measured = {"detail": proxies.detail(scene.photos.images)}
+    measured |= proxies.leave_one_out(engine.params, engine.config, scene.photos, engine.programs)
+    measured["richardson"] = proxies.richardson(
+        engine.params, engine.config, scene.photos, scene.path, engine.settings, engine.programs
+    )
+    return row | {"proxies": measured}
+
+
+def line(x, y) -> tuple[float, float]:
+    """(floor, slope) >= 0 of y = floor + slope x, least squares."""
+    from scipy.optimize import nnls
+
+    (floor, slope), _ = nnls(np.stack([np.ones_like(x), x], 1), np.asarray(y))
+    return float(floor), float(slope)
+
+
+def follow(errors: np.ndarray, rows: list[dict]) -> list[dict]:
+    """How the scene's errors follow each proxy: power laws, the best correlated first.
+
+    The power is the slope in logarithms times r^2, so that a proxy that says little is little believed.
+    """
+    found = []
+    for proxy in ("richardson", "leave_one_out", "redundancy", "detail"):
+        x = np.log([max(row["proxies"][proxy], 1e-9) for row in rows])
+        y = np.log(np.maximum(errors, 1e-9))
+        if len(rows) < 4 or x.std() < 1e-6 or y.std() < 1e-6:
+            continue
+        r = float(np.corrcoef(x, y)[0, 1])
+        power = min(float(np.polyfit(x, y, 1)[0]) * r * r, 1.5)
+        if r > 0.3:
+            found.append((r, {"proxy": proxy, "typical": float(np.exp(x.mean())), "power": power}))
+    return [knob for _, knob in sorted(found, key=lambda pair: -pair[0])]
+
+
+def fit(rows: list[dict], provenance: dict) -> dict:
+    """The planner's table from the rows of `turn_knobs`: averages are root mean squares over scenes."""
+
+    def mean(values):
+        return float(np.sqrt(np.square(np.asarray(values, float)).mean()))
+
+    steps = np.array([[way[3] for way in row["steps"]] for row in rows])
+    ways = [way[:3] for way in rows[0]["steps"]]
+    photos = np.array(
+        [[p[1:] for p in row["photos"]] for row in rows]
+    )  # [s, sets, (lost, gen, head)]
+    flat = photos.reshape(-1, 3)
+    floor, slope = line(flat[:, 0], flat[:, 1])
+    floor_head, slope_head = line(flat[:, 0], flat[:, 2])
+    merge = {k: np.array([row["merge"][k] for row in rows]) for k in MERGES[1:]}
+    half = np.array([row["half"] for row in rows])
+    loss = photos[:, :, 1] / (floor + slope * photos[:, :, 0])
+    by_scene = {
+        "steps": np.exp(np.log(steps / np.sqrt(np.square(steps).mean(0))[None]).mean(1)),
+        "photos": np.sqrt(np.square(loss).mean(1)),
+        "merge": merge[4][:, 0],
+        "half": half[:, 0],
+        "head": np.array([row["head"] for row in rows]),
+    }
+    return {
+        "steps": [
+            {"solver": s, "schedule": g, "steps": k, "evaluations": k, "error": mean(steps[:, i])}
+            for i, (s, g, k) in enumerate(ways)
+        ],
+        "photos": slope,
+        "photos_floor": floor,
+        "photos_head": slope_head,
+        "photos_floor_head": floor_head,
+        "merge": {str(k): mean(v[:, 0]) for k, v in merge.items()},
+        "merge_head": {str(k): mean(v[:, 1]) for k, v in merge.items()},
+        "half": mean(half[:, 0]),
+        "half_head": mean(half[:, 1]),
+        "head": mean([row["head"] for row in rows]),
+        "knobs": {name: follow(errors, rows) for name, errors in by_scene.items()},
+        "provenance": provenance,
+    }
