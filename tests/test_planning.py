@@ -236,6 +236,15 @@ def test_greedy_gains_fall_and_first_comes_who_sees_most(photos):
     assert sum(gains) == pytest.approx(coverage.covered(worth, (0, 1, 2, 3)))
 
 
+def test_photos_of_a_large_scene_are_chosen_by_what_the_path_sees(folder, photos):
+    scene = load_scene(folder / "scene")
+    size = (CONFIG.height, CONFIG.width)
+    assert coverage.see_path(scene, photos.cameras[[3]], 1, *size) == [3]
+    both = coverage.see_path(scene, photos.cameras[[0, 2]], 2, *size)
+    assert sorted(both) == [0, 2]
+    assert len(coverage.see_path(scene, photos.cameras, 9, *size)) == 4
+
+
 def test_coverage_knows_no_unit_and_no_frame(photos, path):
     def moved(cameras):
         pose = np.eye(4)

@@ -7,7 +7,9 @@ photo never lowers it and gains less the more photos there are, so greedy choice
 
 import numpy as np
 
+from ..data.scene import Scene
 from ..geometry.cameras import Cameras, to_host
+from ..geometry.crops import crop_resize_K
 from ..geometry.rays import plucker_float64, project
 from ..geometry.trajectories import focus_distance
 
@@ -59,6 +61,20 @@ def _reach(photos: Cameras, path: Cameras) -> float:
     """A distance for a single photo: three times as far as the path goes from it; 1 if it stays there."""
     reach = np.linalg.norm(path.centres - photos.centres[:1], axis=-1).max()
     return 3.0 * float(reach) if reach > 0 else 1.0
+
+
+def see_path(scene: Scene, path: Cameras, m: int, height: int, width: int) -> list[int]:
+    """Up to m views of a scene that together see most of what the path looks at, best first.
+
+    For scenes of many photos, before they are read: `read_photos(scene, see_path(scene, path, 6, ...), config)`. Fewer
+    than m if further photos would add nothing. The path's K is in pixels of height x width.
+    """
+    K = [
+        crop_resize_K(K, size, (height, width))
+        for K, size in zip(scene.cameras.K, scene.sizes, strict=True)
+    ]
+    worth = coverage(Cameras(np.stack(K), scene.cameras.c2w), path, height, width)
+    return [photo for photo, _ in greedy(worth)][:m]
 
 
 def covered(worth: np.ndarray, chosen: tuple[int, ...]) -> float:

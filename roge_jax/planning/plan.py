@@ -98,8 +98,8 @@ def plan(
     """The cheapest plan that is expected to stay within `tolerance`, or the best one within `max_cost`.
 
     Args:
-      scene: a scene, of which the views `context` (default: those that `sample` takes) are the photos of the full
-        model, or `Photos`. The plan's choice of photos counts among them.
+      scene: `Photos`, all of which the full model sees, or a scene: its views `context`, by default as many as the
+        model takes, chosen by `select_context`. The plan's photos are positions among them.
       path: the cameras to be rendered, as for `sample`.
       tolerance: RMS difference to the full model's frames, colours from 0 to 1; 0 is the full model, bit for bit.
       max_cost: FLOPs of planning and run together; beyond it the tolerance is given up, which `notes` says.
