@@ -214,8 +214,13 @@ def _placed(value: np.ndarray, dtype: Any, sharding: jax.sharding.Sharding | Non
     kept = dtype is None or not jnp.issubdtype(value.dtype, jnp.floating)
     wanted = value.dtype if kept else jnp.dtype(dtype)
 
+    shares: dict[str, np.ndarray] = {}  # devices that repeat one another read the same copy
+
     def share(index) -> np.ndarray:
-        return np.array(value[index], wanted)  # a copy: the file may change while the array lives
+        key = str(index)
+        if key not in shares:  # a copy, because the file may change while the array lives
+            shares[key] = np.array(value[index], wanted)
+        return shares[key]
 
     if sharding is None:
         return jnp.asarray(share(...))
