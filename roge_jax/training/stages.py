@@ -120,7 +120,7 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
         ),
         Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
-        Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=6),
+        Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=12),
         Stage(
             "joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4
         ),
