@@ -42,6 +42,7 @@ BUDGETS = (2, 4, 6, 8, 12, 20)
 TOLERANCES = (0.3, 0.1, 0.03)
 REFERENCE_STEPS = 64
 GOALS = ((8, 0.1), (4, 0.5))  # evaluations, dB
+SAME_SHARPNESS = 0.02  # relative
 
 
 def points(model: str):
@@ -116,11 +117,12 @@ def verdict(records: list[dict], euler50: dict[str, dict[str, float]]) -> dict[s
                 "reached_by_interval": max(abs(gap["low"]), abs(gap["high"])) <= limit,
             }
         )
+    sharp = euler50["sharpness_ratio"]["mean"]
     close = [
         r
         for r in records
         if abs(r["psnr_to_euler50"]["mean"]) <= GOALS[0][1]
-        and r["metrics"]["latent_error"]["mean"] <= euler50["latent_error"]["mean"] * 3
+        and abs(r["metrics"]["sharpness_ratio"]["mean"] / sharp - 1.0) <= SAME_SHARPNESS
     ]
     if close:  # the fewest evaluations among those; then the smallest error
         best = min(close, key=lambda r: (r["evaluations"], r["metrics"]["latent_error"]["mean"]))

@@ -8,8 +8,8 @@ entry of the model in roge_jax/video/schedules.json (grids and where they come f
 Teacher: midpoint, 48 steps, graded towards 0, on training-split scenes with 3 photos. A first grid by dynamic programming
 over the teacher's jump errors (Euler's, and the two-step method's); the better one, or shift, uniform or graded if
 they are better still, is then refined point by point on the sampler's own end error: the relative L2 distance of the target
-latents to the teacher's, mean over scenes. Budgets are 4, 6, 8 and 12 evaluations. About 2200 evaluations of the network
-on the whole batch for all solvers. Our numbers and times: the JSON.
+latents to the teacher's, mean over scenes. Budgets are 4, 6, 8 and 12 evaluations. About 8000 evaluations of
+the network on the whole batch for all solvers. Our numbers and times: the JSON.
 """
 
 import argparse
@@ -117,7 +117,8 @@ def main(args: argparse.Namespace) -> None:
     )
     grids, records = search(problem, check, args.solvers, config.flow.shift)
     found = {
-        "command": "python experiments/optimise_schedules.py",
+        "command": f"python experiments/optimise_schedules.py --checkpoint {args.checkpoint} "
+        f"--solvers {' '.join(args.solvers)} --scenes {args.scenes}",
         "weights": fingerprint(params),
         "search_seeds": list(range(SEARCH, SEARCH + args.scenes)),
         "check_seeds": list(range(CHECK, CHECK + args.scenes)),

@@ -10,7 +10,7 @@ import pytest
 
 from roge_jax.errors import UserError
 from roge_jax.video import flow
-from roge_jax.video.solvers import solve, tabulate
+from roge_jax.video.solvers import SOLVERS, nfe, solve, tabulate
 from roge_jax.video.testbed import random_mixture
 
 
@@ -32,6 +32,20 @@ def test_stored_schedules_are_read_per_model_solver_and_step_count(tmp_path, mon
     monkeypatch.setattr(flow, "OPTIMISED_FILE", tmp_path / "none.json")
     with pytest.raises(UserError, match="none for this model"):
         flow.schedule("optimised", 3, solver="heun", model="small")
+
+
+def test_shipped_schedules_are_usable_by_their_solvers():
+    table = json.loads(flow.OPTIMISED_FILE.read_text())
+    assert table, "the package ships schedules of its trained model"
+    for model, entry in table.items():
+        assert {"weights", "search_seeds", "teacher", "command"} <= entry["found"].keys()
+        for solver, grids in flow.optimised_grids(model).items():
+            for steps in grids:
+                grid = flow.schedule("optimised", steps, solver=solver, model=model)
+                assert len(grid) == steps + 1 and grid[0] == 1 and grid[-1] == 0
+                assert SOLVERS[solver].method is not None
+                # `tabulate` refuses grids that do not descend
+                assert len(tabulate(solver, grid).sigma) == nfe(solver, steps)
 
 
 def test_dynamic_programming_finds_the_cheapest_grid():

@@ -240,7 +240,7 @@ def tables(report: Report) -> str:
         )
     fewest = report["verdict"].get("fewest_evaluations_within_goal", "none")
     lines += [
-        f"* fewest evaluations within 0.1 dB and with at most three times Euler 50's latent error: `{fewest}`; "
+        f"* fewest evaluations within 0.1 dB and 2 % of sharpness of Euler 50: `{fewest}`; "
         f"the default is `{report['verdict']['default']}`.",
         "",
         "Other knobs, default sampler:",

@@ -13,9 +13,9 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+
 from quality.measures import Judge, difference, summary
 from quality.scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos
-
 from roge_jax import config as configs
 from roge_jax import cost, fusion, model
 from roge_jax.config import RoGeConfig
@@ -295,7 +295,7 @@ def refinement(views: int = 12) -> list[Record]:
             "c2w": c2w,
             "vectors": rng.normal(size=(m, 11)),
         }
-        seen = {name: value.astype(np.float32) for name, value in seen.items()}
+        seen = {name: jnp.asarray(value, jnp.float32) for name, value in seen.items()}
         tokens = model.reconstruct(params, seen, config=config)
         query = jax.jit(functools.partial(model.query_rays, config=config))
         features = query(params, tokens, seen).block_until_ready()
