@@ -14,6 +14,7 @@ import jax.numpy as jnp
 
 from . import model
 from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
+from .core.attention import SCORES_BYTES
 from .core.params import flatten
 from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
@@ -291,7 +292,7 @@ def estimate(
     }
 
     def scores(queries: float, keys: float, heads: int) -> float:
-        return 0.0 if fused_attention else 4.0 * queries * keys * heads
+        return 0.0 if fused_attention else min(4.0 * queries * keys * heads, SCORES_BYTES)
 
     e, r, d = config.encoder, config.renderer, config.dit
     chunk = min(r.chunk, m + n)
@@ -303,7 +304,7 @@ def estimate(
         "encode photos (VAE)": MAPS * decoder_tensor_bytes(config, m),
         "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
         "query rays": features
-        + chunk * scores(ray_tokens, scene_tokens, r.heads)
+        + scores(chunk * ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
         "velocity": features

@@ -317,15 +317,12 @@ def sample(
         chosen: list[int] = []
         images, recon, contexts = photos.images, photos.recon, context
         if number and settings.long == "chain":
-            made = np.concatenate(frames)
             kept, chosen = chain_views(context, target[:start], target[start:stop], config)
-            images = np.concatenate([images[kept], made[chosen]])
+            made = [frames[i // config.frames][i % config.frames] for i in chosen]
+            made = np.reshape(made, (-1, *images.shape[1:])).astype(images.dtype)
+            images = np.concatenate([images[kept], made])
             contexts = concatenate(context[kept], target[np.array(chosen, int)])
-            recon = (
-                None
-                if recon is None
-                else np.concatenate([recon[kept], _enlarged(made[chosen], recon)])
-            )
+            recon = None if recon is None else np.concatenate([recon[kept], _enlarged(made, recon)])
         views = window_views(images, recon, contexts, target[start:stop], info, config)
         m, n = len(contexts), stop - start
         usual = generate[number] and config == unplanned
@@ -345,7 +342,7 @@ def sample(
         )
         if not generate[number]:
             with stage("preview"):
-                preview = np.asarray(run.preview(params, views))[:n]
+                preview = np.array(run.preview(params, views))[:n]
             previews.append(preview)
             frames.append(_enlarged(preview, photos.images))
             told[-1]["rgb_head"] = True
@@ -362,8 +359,9 @@ def sample(
         with stage("sample"):
             x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
         with stage("decode"):
-            frames.append(np.asarray(run.decode(params, x0))[:n])
-            previews.append(np.asarray(run.preview(params, prepared.features))[:n])
+            # Copies: on a CPU a view would keep the device's array alive.
+            frames.append(np.array(run.decode(params, x0))[:n])
+            previews.append(np.array(run.preview(params, prepared.features))[:n])
         evaluations += count
     bar.close()
     return Result(

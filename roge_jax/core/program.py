@@ -50,6 +50,7 @@ class Op(NamedTuple):
     params: dict[str, Any]
     shapes: tuple[Any, ...]  # abstract values of all operands, constants included
     scope: str  # names of `jax.named_scope` and of transformations, outermost first
+    bodies: tuple["Program", ...] = ()  # of a loop or of branches
 
 
 class Program(NamedTuple):
@@ -109,7 +110,8 @@ def read(jaxpr, scope: str = "") -> Program:
             else:
                 found = [new(var.aval) for var in eqn.outvars]
                 shapes = tuple(atom.aval for atom in eqn.invars)
-                ops.append(Op(name, tuple(reads), tuple(found), params, shapes, here))
+                bodies = tuple(read(body, here) for body in _bodies(name, params))
+                ops.append(Op(name, tuple(reads), tuple(found), params, shapes, here, bodies))
             env.update(zip(eqn.outvars, found))
 
     env = {var: new(var.aval) for var in [*jaxpr.invars, *jaxpr.constvars]}
@@ -133,8 +135,8 @@ def flops(program: Program, label: Callable[[str], str] = lambda scope: "") -> d
     for op in program.ops:
         if op.name in CONTROL:
             turns = op.params["length"] if op.name == "scan" else 1
-            for body in _bodies(op):
-                for name, value in flops(read(body, op.scope), label).items():
+            for body in op.bodies:
+                for name, value in flops(body, label).items():
                     total[name] = total.get(name, 0.0) + turns * value
         elif op.name in ("dot_general", "conv_general_dilated"):
             out = math.prod(program.values[op.writes[0]].shape)
@@ -152,11 +154,11 @@ def _terms(op: Op) -> float:
     return math.prod(kernel) / kernel[op.params["dimension_numbers"].rhs_spec[0]]
 
 
-def _bodies(op: Op) -> list[Any]:
-    p = op.params
-    if op.name == "cond":
-        return [branch.jaxpr for branch in p["branches"]]
-    return [p["jaxpr" if op.name == "scan" else "body_jaxpr"].jaxpr]
+def _bodies(name: str, params: dict[str, Any]) -> list[Any]:
+    if name == "cond":
+        return [branch.jaxpr for branch in params["branches"]]
+    key = {"scan": "jaxpr", "while": "body_jaxpr"}.get(name)
+    return [params[key].jaxpr] if key else []
 
 
 # ---- memory --------------------------------------------------------------------------------------
@@ -302,8 +304,7 @@ def _held(weight: float, op: Op, aval) -> Held:
 def _inside(op: Op, weigh: Callable[[Any, str], float]) -> Peak:
     """The peak within one turn of a loop or one branch, beside what goes in and comes out."""
     found = []
-    for body in _bodies(op):
-        inner = read(body, op.scope)
+    for inner in op.bodies:
         if op.name != "scan":
             found.append(peak(inner, weigh, elsewhere=inner.inputs))
             continue

@@ -5,6 +5,7 @@ FLOPs; memory of activations comes from the order and fusion rules described the
 XLA's own analysis.
 """
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -18,6 +19,7 @@ import jax.numpy as jnp
 from .. import cost
 from ..config import RoGeConfig
 from ..core import program, sharding
+from ..core.attention import scores_limit
 from ..core.params import Tree, abstract, count, flatten, unflatten
 from ..recon.vggt import encoder_grid
 from .loop import initial_state, make_step
@@ -125,15 +127,13 @@ def plan(
     scenes = stage.batch
     if mesh is not None:
         scenes = sharding.batch_sharding(mesh, stage.batch).shard_shape((stage.batch,))[0]
-    step, arguments = abstract_step(config, stage, m, scenes=scenes, dtype=dtype)
-    with sharding.use(mesh):
-        traced = program.trace(step, *arguments)
+    # Traced with this device's share of the scenes, but all of their tokens.
+    whole = None if mesh is None else sharding.abstract_mesh()
+    share = dataclasses.replace(stage, batch=scenes)
+    traced, arguments = _traced(config, share, m, scenes, jnp.dtype(dtype), fused_attention, whole)
 
     tokens = sequence_lengths(working, m)
-    split = {
-        "transformer": tokens["transformer tokens"],
-        "rays": min(m + working.frames, working.renderer.chunk),
-    }
+    split = split_axes(working, tokens, scenes)
     heads = {c.width // c.heads for c in (config.encoder, config.renderer, config.dit)}
     shares = {tuple(s.shape) for s in flatten(specs).values() if "embed" in s.axes}
 
@@ -143,18 +143,14 @@ def plan(
             return 0.0
         if shape in shares:  # a gradient lies where its parameter does
             return size / sizes["fsdp"]
-        whole = split.get(part(scope))
-        if whole is not None and (whole in shape or whole * scenes in shape):
-            return size / whole * math.ceil(whole / sizes["seq"])
-        return size
+        whole, axes = split.get(part(scope), (1, set()))
+        return size / whole * math.ceil(whole / sizes["seq"]) if axes.intersection(shape) else size
 
     peak = program.peak(traced, weigh)
     work: dict[str, dict[str, float]] = {}
     for label, value in program.flops(traced, lambda s: f"{part(s)} {which_pass(s)}").items():
         name, _, kind = label.partition(" ")
-        share = (
-            sizes["seq"] if name in split else 1
-        )  # what `seq` does not split, its devices repeat
+        share = sizes["seq"] if name in split else 1  # its devices repeat what it does not split
         row = work.setdefault(PARTS.get(name, "the rest"), dict.fromkeys(PASSES, 0.0))
         row[kind] += value / share
     order = [*PARTS.values(), "the rest"]
@@ -178,6 +174,16 @@ def plan(
     )
 
 
+@functools.lru_cache(maxsize=4)
+def _traced(
+    config, stage, m, scenes, dtype, fused_attention, mesh
+) -> tuple[program.Program, tuple]:
+    step, arguments = abstract_step(config, stage, m, scenes=scenes, dtype=dtype)
+    limit = scores_limit(math.inf) if fused_attention else contextlib.nullcontext()
+    with sharding.use(mesh), limit:
+        return program.trace(step, *arguments), arguments
+
+
 def part(scope: str) -> str:
     """The part of the model that an operation belongs to; '' for none."""
     found = re.search(rf"\b({'|'.join(PARTS)})\b", scope)
@@ -199,6 +205,19 @@ def sequence_lengths(config: RoGeConfig, m: int) -> dict[str, int]:
         "rays per view": rays,
         "views": m + config.frames,
         "transformer tokens": cost.tokens_per_slot(config) * config.slots(m),
+    }
+
+
+def split_axes(
+    config: RoGeConfig, tokens: dict[str, int], scenes: int
+) -> dict[str, tuple[int, set[int]]]:
+    """What `seq` splits in a part: how many of them there are, and the lengths of axes that run over them."""
+    chunk, rays = min(tokens["views"], config.renderer.chunk), tokens["rays per view"]
+    per_view = (1, rays, rays + config.renderer.registers, tokens["scene tokens"])
+    whole = tokens["transformer tokens"]
+    return {
+        "transformer": (whole, {whole, whole * scenes}),
+        "rays": (chunk, {n * chunk * t for n in (1, scenes) for t in per_view}),
     }
 
 
