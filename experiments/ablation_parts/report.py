@@ -136,7 +136,7 @@ def draw(rows: dict[str, dict], path: Path) -> None:
 
     fig = plt.figure(figsize=(16.5, 9.5))
     outer = fig.add_gridspec(
-        1, 2, width_ratios=[1, 1.45], left=0.15, right=0.985, top=0.95, bottom=0.065, wspace=0.17
+        1, 2, width_ratios=[1, 1.45], left=0.165, right=0.985, top=0.95, bottom=0.065, wspace=0.17
     )
     _variants(fig.add_subplot(outer[0]), rows)
     right = outer[1].subgridspec(2, 2, hspace=0.27, wspace=0.3)
@@ -166,12 +166,13 @@ def _variants(ax, rows: dict[str, dict]) -> None:
         ax.errorbar(d["mean"], y, xerr=bar, fmt="o", color=COLOURS[word], capsize=3, ms=6)
     for word, colour in COLOURS.items():
         ax.plot([], [], "o", color=colour, label=word.strip("()"))
-    labels = [
-        n if recon[n]["reference"] == "base" else f"{n}\n(against {recon[n]['reference']})"
-        for n in names
-    ]
+    labels = []
+    for name in names:
+        versus = recon[name]["reference"]
+        more = "" if versus == "base" else f"\nagainst {versus}"
+        labels.append(f"{name} ({recon[name]['steps']} steps){more}")
     ax.set_yticks(range(len(names)), labels, fontsize=9)
-    ax.set_xlabel("held-out PSNR less that of the base (dB), mean and 95 % over scenes")
+    ax.set_xlabel("held-out PSNR less that of the base (dB), mean and 95 % interval over scenes")
     base = recon["base"]
     ax.set_title(
         f"{base['tera_flop']:.1f} TFLOP each; base: {base['steps']} steps, {np.mean(base['psnr']):.2f} dB, "
@@ -183,21 +184,23 @@ def _variants(ax, rows: dict[str, dict]) -> None:
 
 
 def _conditions(ax, row: dict) -> None:
-    styles = {"all conditions": ("k", "-")}
+    whole = np.mean(row["errors"]["all conditions"], 0)
     words = [n for n in row["errors"] if n.endswith(": zero")]
-    for k, name in enumerate(words):
-        styles[name] = (f"C{k}", "-")
-        styles[name.replace("zero", "another scene's")] = (f"C{k}", "--")
-    for name, errors in row["errors"].items():
-        colour, line = styles[name]
+    styles = {n: (f"C{k}", "-") for k, n in enumerate(words)}
+    styles |= {n.replace("zero", "another scene's"): (c, "--") for n, (c, _) in styles.items()}
+    for name, (colour, line) in styles.items():
+        rise = 100 * (np.mean(row["errors"][name], 0) / whole - 1)
         label = name.removesuffix(": zero") if line == "-" else None
-        ax.plot(row["sigmas"], np.mean(errors, 0), color=colour, ls=line, marker="o", ms=3, label=label)  # fmt: skip
+        size = 8 if colour == "C1" else 3  # drawn below the case that adds the rays
+        ax.plot(row["sigmas"], rise, color=colour, ls=line, marker="o", ms=size, label=label)
     ax.plot([], [], color="0.4", ls="-", label="solid: zeroed")
     ax.plot([], [], color="0.4", ls="--", label="dashed: of another scene")
-    ax.set(xlabel="noise level sigma", ylabel="held-out flow error")
-    ax.set_title(f"a condition taken away at test time (n = {len(errors)})", fontsize=10)
+    ax.set_yscale("symlog", linthresh=0.1)
+    ax.set(xlabel="noise level sigma", ylabel="rise of the held-out flow error (%)")
+    count = len(row["errors"]["all conditions"])
+    ax.set_title(f"a condition taken away at test time (n = {count})", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.legend(fontsize=7)
+    ax.legend(fontsize=7, ncols=2, loc="center", bbox_to_anchor=(0.5, 0.6))
 
 
 def _finetune(ax, row: dict) -> None:
