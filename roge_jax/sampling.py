@@ -318,8 +318,8 @@ def sample(
         images, recon, contexts = photos.images, photos.recon, context
         if number and settings.long == "chain":
             kept, chosen = chain_views(context, target[:start], target[start:stop], config)
-            made = [frames[i // config.frames][i % config.frames] for i in chosen]
-            made = np.reshape(made, (-1, *images.shape[1:])).astype(images.dtype)
+            found = [frames[i // config.frames][i % config.frames] for i in chosen]
+            made = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
             images = np.concatenate([images[kept], made])
             contexts = concatenate(context[kept], target[np.array(chosen, int)])
             recon = None if recon is None else np.concatenate([recon[kept], _enlarged(made, recon)])

@@ -40,16 +40,16 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
             )
             return y / s.sum(-1, keepdims=True)
 
-    *lead, length, width = q.shape
+    *outer, length, width = q.shape
     pieces = max(1, math.ceil(4.0 * math.prod(q.shape[:-1]) * k.shape[-2] / _LIMIT.get()))
     if pieces == 1:
         y = some(q)
     else:
         size = -(-length // pieces)
-        q = jnp.pad(q, [(0, 0)] * len(lead) + [(0, size * pieces - length), (0, 0)])
-        q = jnp.moveaxis(q.reshape(*lead, pieces, size, width), -3, 0)
+        q = jnp.pad(q, [(0, 0)] * len(outer) + [(0, size * pieces - length), (0, 0)])
+        q = jnp.moveaxis(q.reshape(*outer, pieces, size, width), -3, 0)
         y = jnp.moveaxis(jax.lax.map(jax.checkpoint(some), q), 0, -3)
-        y = y.reshape(*lead, pieces * size, v.shape[-1])[..., :length, :]
+        y = y.reshape(*outer, pieces * size, v.shape[-1])[..., :length, :]
     return checkpoint_name(jnp.swapaxes(y, -3, -2), "attention")
 
 

@@ -129,8 +129,8 @@ def plan(
         scenes = sharding.batch_sharding(mesh, stage.batch).shard_shape((stage.batch,))[0]
     # Traced with this device's share of the scenes, but all of their tokens.
     whole = None if mesh is None else sharding.abstract_mesh()
-    share = dataclasses.replace(stage, batch=scenes)
-    traced, arguments = _traced(config, share, m, scenes, jnp.dtype(dtype), fused_attention, whole)
+    part_of = dataclasses.replace(stage, batch=scenes)
+    traced, arguments = _traced(config, part_of, m, scenes, jnp.dtype(dtype), fused_attention, whole)
 
     tokens = sequence_lengths(working, m)
     split = split_axes(working, tokens, scenes)
