@@ -121,12 +121,17 @@ def draw_batch(
         rng = np.random.default_rng(
             [seed, index, 2 + int(j)]
         )  # [.., 0] would repeat the stream of M
-        sequence = pool[int(rng.integers(len(pool)))]
+        number = int(rng.integers(len(pool)))
+        sequence = pool[number]
         contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
         views = np.concatenate([contexts, targets])
         rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
         c2w = np.asarray(sequence["c2w"][views], np.float64)
         if cfg.augment:
             rgb, K, c2w = alter(rng, rgb, K, c2w)
-        samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))
+        try:
+            samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))
+        except UserError as error:
+            chosen = ", ".join(str(view) for view in views)
+            raise UserError(f"Sequence {number} of the data, frames {chosen}: {error}") from error
     return {name: np.stack([s[name] for s in samples]) for name in samples[0]}

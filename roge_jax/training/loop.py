@@ -217,6 +217,7 @@ def train(
         if is_main():
             log_path.unlink(missing_ok=True)
     elif resume:
+        checkpoints.verify(latest)
         _check_fits(checkpoints.folder, latest, state)
         state = checkpoints.restore(state, latest)
         if is_main():
