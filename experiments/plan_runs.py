@@ -14,8 +14,8 @@ from roge_jax.data import procedural
 from roge_jax.data.raycast import OBJECTS, ROOM, render_views
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.planning import coverage, proxies
-from roge_jax.planning.options import MERGES, full_choices
-from roge_jax.video import flow
+from roge_jax.planning.options import LEAST_LOSS, MERGES, full_choices
+from roge_jax.video import flow, solvers
 from roge_jax.windows import window_views
 
 CONTEXTS = 6
@@ -177,6 +177,7 @@ class Engine:
             settings.steps,
             shift=self.config.flow.shift,
             solver=settings.solver,
+            model=self.config.name,
         )
         run, bar = SimpleNamespace(velocity=self.velocity), SimpleNamespace(update=lambda n: None)
         x0, _ = sampling.integrate(
@@ -198,18 +199,13 @@ BASE = {
 }  # at which photos, tokens and size are compared: their effect, not that of few steps
 
 
-def stored_ways() -> list[tuple[str, str, int]]:
-    """Optimised schedules of one evaluation per step, where they are stored."""
-    import json
-
-    if not flow.OPTIMISED_FILE.exists():
-        return []
-    grids = json.loads(flow.OPTIMISED_FILE.read_text()).get("grids", {})
+def stored_ways(name: str) -> list[tuple[str, str, int]]:
+    """Optimised schedules of the model, at most 8 evaluations."""
     return [
-        (solver, "optimised", int(k))
-        for solver in ("unipc_2", "ab2", "euler", "dpmpp_2m")
-        for k in grids.get(solver, {})
-        if int(k) <= 8
+        (solver, "optimised", steps)
+        for solver, grids in flow.optimised_grids(name).items()
+        for steps in grids
+        if solvers.nfe(solver, steps) <= 8
     ]
 
 
@@ -233,7 +229,7 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     row["head"] = rms(engine.run(scene, head), reference)
     row["steps"] = [
         [*way, rms(engine.run(scene, dataclasses.replace(full, solver=way[0], schedule=way[1], steps=way[2])), reference)]
-        for way in [*WAYS, *stored_ways()]
+        for way in [*WAYS, *stored_ways(engine.config.name)]
     ]  # fmt: skip
     row["merge"] = {merge: both(merge=merge) for merge in MERGES[1:]}
     row["half"] = both(recon=(small.recon_height, small.recon_width))
@@ -255,30 +251,34 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     return row | {"proxies": measured}
 
 
-def line(x, y) -> tuple[float, float]:
-    """(floor, slope) >= 0 of y = floor + slope x, least squares."""
-    from scipy.optimize import nnls
+# Which proxies may speak for a knob, so that few scenes do not make chance a law.
+SPEAK = {
+    "steps": ("richardson", "detail"),
+    "photos": ("leave_one_out", "detail"),
+    "merge": ("redundancy", "leave_one_out", "detail"),
+    "half": ("redundancy", "leave_one_out", "detail"),
+    "head": ("leave_one_out", "redundancy", "detail"),
+}
 
-    (floor, slope), _ = nnls(np.stack([np.ones_like(x), x], 1), np.asarray(y))
-    return float(floor), float(slope)
 
+def follow(knob: str, errors: np.ndarray, rows: list[dict]) -> list[dict]:
+    """How a knob's error follows each proxy from scene to scene: power laws, the best correlated first.
 
-def follow(errors: np.ndarray, rows: list[dict]) -> list[dict]:
-    """How the scene's errors follow each proxy: power laws, the best correlated first.
-
-    The power is the slope in logarithms times r^2, so that a proxy that says little is little believed.
+    The power is the slope in logarithms times the adjusted r^2, so that a proxy that says little is little believed.
     """
     found = []
-    for proxy in ("richardson", "leave_one_out", "redundancy", "detail"):
+    for proxy in SPEAK[knob]:
         x = np.log([max(row["proxies"][proxy], 1e-9) for row in rows])
-        y = np.log(np.maximum(errors, 1e-9))
-        if len(rows) < 4 or x.std() < 1e-6 or y.std() < 1e-6:
+        y, n = np.log(np.maximum(errors, 1e-9)), len(rows)
+        if n < 4 or x.std() < 1e-6 or y.std() < 1e-6:
             continue
         r = float(np.corrcoef(x, y)[0, 1])
-        power = min(float(np.polyfit(x, y, 1)[0]) * r * r, 1.5)
-        if r > 0.3:
-            found.append((r, {"proxy": proxy, "typical": float(np.exp(x.mean())), "power": power}))
-    return [knob for _, knob in sorted(found, key=lambda pair: -pair[0])]
+        trust = 1.0 - (1.0 - r * r) * (n - 1) / (n - 2)
+        power = min(float(np.polyfit(x, y, 1)[0]) * trust, 1.5)
+        if r > 0 and trust > 0.05:
+            known = {"proxy": proxy, "typical": float(np.exp(x.mean())), "power": power, "r": r}
+            found.append((r, known))
+    return [known for _, known in sorted(found, key=lambda pair: -pair[0])]
 
 
 def fit(rows: list[dict], provenance: dict) -> dict:
@@ -289,36 +289,33 @@ def fit(rows: list[dict], provenance: dict) -> dict:
 
     steps = np.array([[way[3] for way in row["steps"]] for row in rows])
     ways = [way[:3] for way in rows[0]["steps"]]
-    photos = np.array(
-        [[p[1:] for p in row["photos"]] for row in rows]
-    )  # [s, sets, (lost, gen, head)]
-    flat = photos.reshape(-1, 3)
-    floor, slope = line(flat[:, 0], flat[:, 1])
-    floor_head, slope_head = line(flat[:, 0], flat[:, 2])
+    # [scenes, sets, (share lost, error generated, error of the RGB head)]
+    photos = np.array([[p[1:] for p in row["photos"]] for row in rows])
+    rate = photos[..., 1:] / np.sqrt(np.maximum(photos[..., :1], LEAST_LOSS))
     merge = {k: np.array([row["merge"][k] for row in rows]) for k in MERGES[1:]}
     half = np.array([row["half"] for row in rows])
-    loss = photos[:, :, 1] / (floor + slope * photos[:, :, 0])
     by_scene = {
         "steps": np.exp(np.log(steps / np.sqrt(np.square(steps).mean(0))[None]).mean(1)),
-        "photos": np.sqrt(np.square(loss).mean(1)),
+        "photos": np.sqrt(np.square(rate[..., 0]).mean(1)),
         "merge": merge[4][:, 0],
         "half": half[:, 0],
         "head": np.array([row["head"] for row in rows]),
     }
     return {
         "steps": [
-            {"solver": s, "schedule": g, "steps": k, "evaluations": k, "error": mean(steps[:, i])}
+            {
+                **{"solver": s, "schedule": g, "steps": k},
+                **{"evaluations": solvers.nfe(s, k), "error": mean(steps[:, i])},
+            }
             for i, (s, g, k) in enumerate(ways)
         ],
-        "photos": slope,
-        "photos_floor": floor,
-        "photos_head": slope_head,
-        "photos_floor_head": floor_head,
+        "photos": mean(rate[..., 0]),
+        "photos_head": mean(rate[..., 1]),
         "merge": {str(k): mean(v[:, 0]) for k, v in merge.items()},
         "merge_head": {str(k): mean(v[:, 1]) for k, v in merge.items()},
         "half": mean(half[:, 0]),
         "half_head": mean(half[:, 1]),
         "head": mean([row["head"] for row in rows]),
-        "knobs": {name: follow(errors, rows) for name, errors in by_scene.items()},
+        "knobs": {name: follow(name, errors, rows) for name, errors in by_scene.items()},
         "provenance": provenance,
     }

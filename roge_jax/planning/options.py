@@ -15,12 +15,13 @@ from ..config import RoGeConfig
 from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling import Choices, Photos, Settings
-from ..video import solvers
+from ..video import flow, solvers
 from ..windows import chained, windows
 from . import coverage, proxies
 from .table import Table
 from .table import scale as factor
 
+LEAST_LOSS = 0.002  # of coverage: no change of photos is free
 MERGES: tuple[Literal[1, 2, 4], ...] = (1, 2, 4)
 
 
@@ -64,7 +65,12 @@ def list_options(
     if worth is None:
         return options
     scale = {name: factor(knobs, measured) for name, knobs in table.knobs.items()}
-    steps = [(s.solver, s.schedule, s.steps, s.evaluations, s.error) for s in table.steps]
+    stored = flow.optimised_grids(config.name)
+    steps = [
+        (s.solver, s.schedule, s.steps, s.evaluations, s.error)
+        for s in table.steps
+        if s.schedule != "optimised" or s.steps in stored.get(s.solver, {})
+    ]
     steps = [s for s in steps if s[3] < evaluations]
     steps.append((full.solver, full.schedule, full.steps, evaluations, 0.0))
     sizes: list[tuple[tuple[int, int], float, float]] = [(full.recon, 0.0, 0.0)]
@@ -80,12 +86,8 @@ def list_options(
     for (kept, lost), (merge, *e_merge), (size, *e_size) in itertools.product(
         _photo_sets(worth), merges, sizes
     ):
-        e_photos = (0.0, 0.0)
-        if lost is not None:
-            e_photos = (
-                table.photos_floor + table.photos * lost,
-                table.photos_floor_head + table.photos_head * lost,
-            )
+        share = 0.0 if lost is None else np.sqrt(max(lost, LEAST_LOSS))
+        e_photos = (table.photos * share, table.photos_head * share)
         loss, head = (
             np.sqrt(
                 (scale["photos"] * e_photos[k]) ** 2

@@ -27,7 +27,7 @@ from .options import Option, choose, full_choices, list_options, next_best, trai
 from .table import Table, load
 
 TOLERANCE = 0.02
-PROBE = 0.08
+PROBE = 0.04
 
 
 class Purchase(NamedTuple):

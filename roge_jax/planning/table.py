@@ -23,6 +23,7 @@ class Knob:
     proxy: str
     typical: float
     power: float
+    r: float = 1.0  # correlation of the logarithms over the scenes measured
 
 
 def scale(knobs: tuple[Knob, ...], measured: dict[str, float]) -> float:
@@ -48,17 +49,15 @@ class Step:
 class Table:
     """RMS errors of single knobs, in colours from 0 to 1, averages (root mean square) over scenes.
 
-    `photos`: error per unit of coverage lost, the share of it lost at all being what remains (`photos_floor`) of any
-    change of photos. `merge`, `half`: fewer scene tokens, reconstruction at half size. `head`: frames of the RGB head
-    in place of generated ones. The `_head` values hold for frames of the RGB head.
+    `photos`: error per square root of the share of coverage lost (a pixel is seen well or not: squares add). `merge`,
+    `half`: fewer scene tokens, reconstruction at half size. `head`: frames of the RGB head in place of generated ones.
+    The `_head` values hold for frames of the RGB head.
     """
 
     name: str
     steps: tuple[Step, ...]
     photos: float
-    photos_floor: float
     photos_head: float
-    photos_floor_head: float
     merge: dict[int, float]
     merge_head: dict[int, float]
     half: float
