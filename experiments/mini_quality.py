@@ -26,14 +26,22 @@ import jax
 import numpy as np
 from quality import charts, knobs
 from quality.measures import MEANING, Judge, difference, summary
-from quality.scenes import ALL_SOLVERS, DEFAULT_M, Sampler, assemble, fingerprint, render
+from quality.scenes import (
+    ALL_SOLVERS,
+    DEFAULT_M,
+    Sampler,
+    assemble,
+    fingerprint,
+    most_steps,
+    render,
+)
 
 from roge_jax.checkpoint import load_model
 from roge_jax.data.procedural import HELDOUT_SEED
 from roge_jax.entry import enable_cache
 from roge_jax.errors import UserError
 from roge_jax.sampling import SCHEDULE, SOLVER, STEPS
-from roge_jax.video import flow, solvers
+from roge_jax.video import flow
 
 OUT = Path(__file__).parent / "results"
 DOCUMENT = Path(__file__).parent.parent / "docs" / "solvers.md"
@@ -53,11 +61,6 @@ def points(model: str):
         for schedule in SCHEDULES:
             for n in stored.get(solver, {}) if schedule == "optimised" else steps:
                 yield solver, schedule, n
-
-
-def most_steps(solver: str, budget: int) -> int:
-    """The most steps within a budget of evaluations, 0 if none."""
-    return max((n for n in range(1, budget + 1) if solvers.nfe(solver, n) <= budget), default=0)
 
 
 def sweep(sampler: Sampler, judge: Judge) -> tuple[list[dict], dict[str, Any]]:

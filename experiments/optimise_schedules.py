@@ -22,7 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from quality.scenes import DEFAULT_M, Sampler, assemble, fingerprint, render
+from quality.scenes import DEFAULT_M, Sampler, assemble, fingerprint, most_steps, render
 
 from roge_jax import model
 from roge_jax.checkpoint import load_model
@@ -34,11 +34,6 @@ SEARCH, CHECK = 11, 21  # first training-split seeds of the scenes for search an
 TEACHER_STEPS = 48
 BUDGETS = (4, 6, 8, 12)
 SOLVERS = ("euler", "ab2", "unipc_2", "dpmpp_2m", "midpoint", "heun")
-
-
-def steps_for(solver: str, budget: int) -> int:
-    """The most steps within a budget of evaluations (one more where the last step is shorter)."""
-    return max(n for n in range(1, budget + 1) if n == 1 or solvers.nfe(solver, n) <= budget)
 
 
 class Problem:
@@ -82,7 +77,7 @@ def search(problem: Problem, check: Problem, names: list[str], shift: float):
     for solver in names:
         grids[solver] = {}
         for budget in BUDGETS:
-            steps = steps_for(solver, budget)
+            steps = most_steps(solver, budget)
             known = {
                 k: flow.schedule(k, steps, shift=shift) for k in ("shift", "uniform", "graded")
             }

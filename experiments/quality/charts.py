@@ -65,6 +65,7 @@ def samplers(report: Report, path: Path) -> None:
                 ax.set_xlabel("velocity evaluations")
             else:
                 ax.set_xlabel("seconds a scene (sampling)")
+                plain_seconds(ax, [r["seconds"] for r in report["records"]])
         for row in (0, 3):
             ax = axes[row, column]
             ax.set_yscale("log")
@@ -101,6 +102,16 @@ def samplers(report: Report, path: Path) -> None:
     plt.close(fig)
 
 
+def plain_seconds(ax, seconds: list[float]) -> None:
+    """1, 2 and 5 as tick labels instead of powers, over all of `seconds`."""
+    low, high = 0.8 * min(seconds), 1.25 * max(seconds)
+    ticks = [d * 10.0**e for e in range(-4, 4) for d in (1, 2, 5) if low <= d * 10.0**e <= high]
+    ax.set_xscale("log")
+    ax.set_xticks(ticks, [f"{t:g}" for t in ticks])
+    ax.minorticks_off()
+    ax.set_xlim(low, high)
+
+
 ROWS = (
     ("evaluations", lambda r: r["metrics"]["latent_error"]),
     ("evaluations", lambda r: r["psnr_to_euler50"]),
@@ -121,6 +132,8 @@ def knobs(report: Report, path: Path) -> None:
 
     def curve(ax, rows, metric, x, method, label=None):
         colour, marker = METHODS[method]
+        if method == "generation only":
+            label = "generation only (the model's conditions zeroed)"
         values = [r["metrics"][metric] for r in rows]
         ax.plot([x(r) for r in rows], [v["mean"] for v in values], color=colour, marker=marker, ms=5, label=label or method)  # fmt: skip
         ax.fill_between([x(r) for r in rows], [v["low"] for v in values], [v["high"] for v in values], color=colour, alpha=0.1, lw=0)  # fmt: skip
@@ -138,13 +151,18 @@ def knobs(report: Report, path: Path) -> None:
         if metric == "consistency":
             ax.axhline(ceiling["truth"][metric]["mean"], color="k", ls=":", lw=1, label="the truth itself")  # fmt: skip
             ax.set_ylim(top=ceiling["truth"][metric]["mean"] + 8)  # one photo for all frames
-        ax.set(xlabel="photos M", ylabel=label)
+        ax.set(
+            xlabel="photos M",
+            ylabel=label,
+            xticks=sorted({r["value"] for r in records if r["knob"] == "M"}),
+        )
     axes[0, 2].legend(fontsize=8, loc="best")
 
     ax = axes[1, 0]
     solver, schedule, _ = report["verdict"]["default"].split()
     full = [r for r in report["records"] if r["solver"] == solver and r["schedule"] == schedule]
-    curve(ax, sorted(full, key=lambda r: r["evaluations"]), "psnr", lambda r: r["evaluations"], "generated", f"generated ({solver} {schedule})")  # fmt: skip
+    full.sort(key=lambda r: r["evaluations"])
+    curve(ax, full, "psnr", lambda r: r["evaluations"], "generated", f"generated ({solver} {schedule})")  # fmt: skip
     bare = [r for r in records if r["knob"] == "steps"]
     curve(ax, bare, "psnr", lambda r: r["evaluations"], "generation only")
     for method in ("RGB head", "plane"):
@@ -164,9 +182,9 @@ def knobs(report: Report, path: Path) -> None:
         v = r["metrics"]["psnr"]
         ax.errorbar(r["seconds"], v["mean"], [[v["mean"] - v["low"]], [v["high"] - v["mean"]]], fmt="o", color="#d62728", capsize=3)  # fmt: skip
         ax.annotate(f"{r['value']}\nsharpness {r['metrics']['sharpness_ratio']['mean']:.2f}", (r["seconds"], v["mean"]), xytext=(7, 5), textcoords="offset points", fontsize=8)  # fmt: skip
-    ax.set(xlabel="seconds a scene (sampling)", ylabel="PSNR at the training size, dB", title="size of photos and frames")  # fmt: skip
-    ax.set_xscale("log")
-    ax.margins(x=0.35)
+    ax.set(xlabel="seconds a scene (sampling)", ylabel="PSNR at the training size, dB", title="size of photos and frames, default sampler")  # fmt: skip
+    seconds = [r["seconds"] for r in records if r["knob"] == "resolution"]
+    plain_seconds(ax, [min(seconds), 2 * max(seconds)])
 
     ax = axes[1, 2]
     cached = [r for r in records if r["knob"] == "cache"]
@@ -175,9 +193,10 @@ def knobs(report: Report, path: Path) -> None:
         v = r["metrics"]["latent_error"]
         ax.errorbar(r["seconds"], v["mean"], [[v["mean"] - v["low"]], [v["high"] - v["mean"]]], fmt="o" if kind == "exact" else "s", color="k" if kind == "exact" else "#ff7f0e", capsize=3)  # fmt: skip
         ax.annotate(r["value"], (r["seconds"], v["mean"]), xytext=(7, 5), textcoords="offset points", fontsize=8)  # fmt: skip
-    ax.plot([r["seconds"] for r in full], [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, fewer steps instead")  # fmt: skip
-    ax.set(xscale="log", yscale="log", xlabel="seconds a scene (sampling)", ylabel="relative L2 error of the latents", title="block cache against exact")  # fmt: skip
-    ax.margins(x=0.3)
+    ax.plot([r["seconds"] for r in full], [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, other step counts")  # fmt: skip
+    ax.set(yscale="log", xlabel="seconds a scene (sampling)", ylabel="relative L2 error of the latents", title="block cache (squares) against exact (dots)")  # fmt: skip
+    seconds = [r["seconds"] for r in [*full, *cached]]
+    plain_seconds(ax, [min(seconds), 3 * max(seconds)])
     ax.legend(fontsize=8)
     for ax in axes.flat:
         ax.grid(True, alpha=0.25)

@@ -173,6 +173,11 @@ def _compiled(config: RoGeConfig):
     return jax.jit(functools.partial(_field, config=config))
 
 
+def most_steps(solver: str, budget: int) -> int:
+    """The most steps within a budget of evaluations, 0 if none."""
+    return max((n for n in range(1, budget + 1) if solvers.nfe(solver, n) <= budget), default=0)
+
+
 def fingerprint(params: Any) -> str:
     """Twelve hexadecimal digits that change with any weight of the velocity network."""
     digest = hashlib.sha256()
