@@ -1,6 +1,6 @@
 """What the trained model stands: quality against every disturbance of photos, cameras and path, and where it breaks.
 
-    OPENBLAS_NUM_THREADS=1 python experiments/robustness.py 8              # results/robustness*.{json,png}
+    OPENBLAS_NUM_THREADS=1 python experiments/robustness.py 8              # results/robustness*.{json,md,png}
     OPENBLAS_NUM_THREADS=1 python experiments/robustness.py 8 --limits     # and roge_jax/assets/limits.json
 
 CPU, 4 cores: about one minute a scene after two minutes of compilation. Scenes: held-out procedural seeds from
@@ -357,7 +357,9 @@ def main() -> None:
     for metric, suffix in (("psnr", ""), ("ssim", "_ssim"), ("sharpness_ratio", "_sharpness")):
         count = len(document["settings"]["seeds"])
         draw(found, document["breaks"], metric, count, OUT / f"robustness{suffix}.png")
-    print(summary(document))
+    text = summary(document)
+    (OUT / "robustness.md").write_text(text + "\n")
+    print(text)
     if args.limits:
         write_limits(document)
         print(f"wrote {limits.TABLE}")

@@ -17,7 +17,7 @@ METRICS = ("psnr", "ssim", "sharpness_ratio")
 MODELS, METHODS = ("rgb_head", "generated"), ("rgb_head", "generated", "nearest", "plane")
 LOSS = 1.0  # dB
 RESAMPLES = 2000
-REACHES = (0.5, 1.0, 1.5, 2.0, 2.5)  # baselines
+REACHES = (0.25, 0.5, 1.0, 1.5, 2.0, 2.5)  # baselines
 
 
 class Knob(NamedTuple):
@@ -29,21 +29,21 @@ class Knob(NamedTuple):
 
 
 KNOBS = {
-    "rotation": Knob("pose: rotation", "RMS error of the photos, degrees", (0.5, 1, 2, 4, 8)),
-    "position": Knob("pose: position", "RMS error, fraction of the baseline", (0.02, 0.05, 0.1, 0.2, 0.4)),
-    "focal": Knob("focal length", "error of the photos, %, either sign", (2.5, 5, 10, 20, 40)),
-    "noise": Knob("photo noise", "standard deviation (white = 1)", (0.02, 0.05, 0.1, 0.2)),
+    "rotation": Knob("pose: rotation", "RMS error of the photos, degrees", (1, 2, 4, 8, 16)),
+    "position": Knob("pose: position", "RMS error, fraction of the baseline", (0.05, 0.1, 0.2, 0.4, 0.8)),
+    "focal": Knob("focal length", "error of the photos, %, either sign", (5, 10, 20, 40)),
+    "noise": Knob("photo noise", "standard deviation (white = 1)", (0.05, 0.1, 0.2, 0.3)),
     "blur": Knob("photo blur", "Gaussian sigma, pixels of 112", (0.5, 1, 2, 4)),
     "jpeg": Knob("JPEG", "quality", (50, 20, 10, 5), 100, True),
-    "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.5, 1, 2, 3)),
+    "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.5, 1, 1.5, 2)),
     "photos": Knob("fewer photos", "photos, all distinct", (2, 1), 3),
     "more": Knob("more photos", "photos, all distinct", (4, 6), 3),
     "copies": Knob("repeated photos", "distinct photos of 3", (2, 1), 3),
     "padding": Knob("repeated photos", "photos, of which 3 distinct", (6,), 3),
     "crowding": Knob("crowded photos", "spacing of the photos, 1 = even", (0.6, 0.4, 0.2), 1.0),
     "extrapolation": Knob("extrapolation", "targets outside the photos' hull, baselines", REACHES),
-    "wider": Knob("wider targets", "field of view over the photos' (tangents)", (1.2, 1.5, 2, 3), 1.0, True),
-    "narrower": Knob("narrower targets", "field of view over the photos'", (0.8, 0.6, 0.4, 0.25), 1.0, True),
+    "wider": Knob("wider targets", "field of view over the photos' (tangents)", (1.05, 1.1, 1.2, 1.5, 2), 1.0, True),
+    "narrower": Knob("narrower targets", "field of view over the photos'", (0.95, 0.9, 0.8, 0.6, 0.4), 1.0, True),
 }  # fmt: skip
 
 # The run-time measure (of `roge_jax.limits`) that shows a knob, where one does.
@@ -78,8 +78,7 @@ def with_interval(levels, per_scene: np.ndarray, log: bool) -> dict[str, Any]:
     draws = np.random.default_rng(0).integers(
         0, per_scene.shape[1], (RESAMPLES, per_scene.shape[1])
     )
-    mean = np.nanmean(per_scene, 1)
-    sampled = np.nanmean(per_scene[:, draws], 2)  # [levels, resamples]
+    mean, sampled = _mean(per_scene), _mean(per_scene[:, draws])  # [levels], [levels, resamples]
     found = np.array([crossing(levels, column, log) for column in sampled.T])
     outwards = 1.0 if levels[-1] > levels[0] else -1.0
     ordered = np.sort(np.where(np.isnan(found), np.inf, outwards * found))
@@ -93,8 +92,15 @@ def with_interval(levels, per_scene: np.ndarray, log: bool) -> dict[str, Any]:
     }
 
 
+def _mean(x: np.ndarray) -> np.ndarray:
+    """Over the last axis, without NaN (a distance that a scene does not reach); NaN if nothing is left."""
+    known = np.isfinite(x)
+    total = np.where(known, x, 0.0).sum(-1)
+    return np.where(known.any(-1), total / np.maximum(known.sum(-1), 1), np.nan)
+
+
 def breaks(found: dict[str, dict]) -> dict[str, dict[str, Any]]:
-    """{knob: {method: {"loses_1_db": .., "below_nearest": ..}}}."""
+    """{knob: {method: {"loses_1_db": .., "loses_3_db": .., "below_nearest": ..}}}."""
     result: dict[str, dict] = {}
     for knob, data in found.items():
         levels, log = np.array(data["levels"]), KNOBS[knob].log
@@ -104,6 +110,7 @@ def breaks(found: dict[str, dict]) -> dict[str, dict[str, Any]]:
             own = psnr[method]
             result[knob][method] = {
                 "loses_1_db": with_interval(levels, own - own[:1] + LOSS, log),
+                "loses_3_db": with_interval(levels, own - own[:1] + 3 * LOSS, log),
                 "below_nearest": with_interval(levels, own - psnr["nearest"], log),
             }
     return result
@@ -176,7 +183,7 @@ def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> Non
         title = "field of view of the targets" if knobs == ("narrower", "wider") else title
         ax.set(title=title, xlabel=knob.unit)
         if knob.log:
-            ticks = sorted({x for k in knobs for x in found[k]["levels"]})
+            ticks = spaced({x for k in knobs for x in found[k]["levels"]}, knob.still)
             ax.set_xscale("log")
             ax.set_xticks(ticks, [f"{x:g}" for x in ticks])
             ax.minorticks_off()
@@ -199,6 +206,16 @@ def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> Non
     fig.tight_layout(rect=(0, 0.035, 1, 1))
     fig.savefig(path, dpi=80)
     plt.close(fig)
+
+
+def spaced(levels: set[float], first: float) -> list[float]:
+    """Levels whose labels do not overlap on a logarithmic axis, the undisturbed one first."""
+    gap = 0.09 * math.log(max(levels) / min(levels))
+    kept = [first]
+    for x in sorted(levels, key=lambda x: -abs(math.log(x / first))):
+        if all(abs(math.log(x / y)) > gap for y in kept):
+            kept.append(x)
+    return sorted(kept)
 
 
 def joined(found: dict, knobs: tuple[str, ...], method: str, metric: str):
@@ -235,7 +252,7 @@ def write_limits(document: dict) -> None:
 
 
 def summary(document: dict) -> str:
-    """The breaks as a table in markdown."""
+    """Breaks and limits as tables in markdown."""
 
     def cell(end: dict) -> str:
         if end["at"] is None:
@@ -243,15 +260,28 @@ def summary(document: dict) -> str:
         low, high = ("-" if x is None else f"{x:.3g}" for x in end["interval"])
         return f"{end['at']:.3g} [{low}, {high}]"
 
+    settings = document["settings"]
+    base = document["knobs"]["rotation"]["scores"]
+    undisturbed = ", ".join(f"{LABELS[m]} {np.mean(base[m]['psnr'][0]):.2f}" for m in METHODS)
     lines = [
-        "| knob | RGB head loses 1 dB | video loses 1 dB | RGB head below nearest | video below nearest |",
-        "|---|---|---|---|---|",
+        f"{len(settings['seeds'])} held-out scenes from seed {settings['seeds'][0]}, weights {settings['weights']}, commit "
+        f"{document['commit']}. Undisturbed PSNR, dB: {undisturbed}.",
+        "",
+        "| knob, unit (undisturbed) | RGB head -1 dB | video -1 dB | RGB head -3 dB | video -3 dB | RGB head below nearest | video below nearest |",
+        "|---|---|---|---|---|---|---|",
     ]
-    for knob, row in document["breaks"].items():
-        cells = [cell(row[m][k]) for k in ("loses_1_db", "below_nearest") for m in MODELS]
-        lines.append(f"| {KNOBS[knob].title}: {KNOBS[knob].unit} | {' | '.join(cells)} |")
+    for name, row in document["breaks"].items():
+        knob = KNOBS[name]
+        kinds = ("loses_1_db", "loses_3_db", "below_nearest")
+        cells = [cell(row[m][k]) for k in kinds for m in MODELS]
+        lines.append(f"| {knob.title}: {knob.unit} ({knob.still:g}) | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "| warning | limit | undisturbed scenes beyond it | scenes beyond it at the last level |",
+        "|---|---|---|---|",
+    ]
     for kind, row in document["limits"].items():
-        lines.append(
-            f"{kind}: limit {row['limit']:.3g} ({row['measure']}), undisturbed beyond it {row['undisturbed_beyond']:.0%}"
-        )
+        limit = f"{row['limit']:.3g}" + ("" if row["broke"] else " (end of the range)")
+        shares = f"{row['undisturbed_beyond']:.0%} | {row['last_level_beyond']:.0%}"
+        lines.append(f"| {kind}: {row['measure']} | {limit} | {shares} |")
     return "\n".join(lines)

@@ -181,6 +181,17 @@ def test_one_warning_beyond_a_limit_and_none_within(kind):
     assert limits.beyond(images, context, target, {}) == []  # a model without measured limits
 
 
+def test_shipped_limits_say_where_they_come_from():
+    row = json.loads(limits.TABLE.read_text())["mini"]
+    assert {"command", "commit", "weights", "seeds", "scenes", "criterion"} <= set(
+        row["provenance"]
+    )
+    assert set(limits.table("mini")) == set(LIMITS)
+    for kind, one in row["limits"].items():
+        assert np.isfinite(one["limit"]) and isinstance(one["broke"], bool), kind
+    assert limits.table("tiny") == {}
+
+
 def without_network(params, views, config, slots):
     """Programs that give grey frames: nothing is compiled."""
     video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
