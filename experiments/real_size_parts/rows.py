@@ -1,0 +1,355 @@
+"""The rows of `experiments/real_size.py`: what each one computes, at which size. Run by it in a process of its own:
+
+    python rows.py --row NAME --side ours|peer --out FILE [--repeats 10] [--seconds 600]
+
+FILE gets the row as JSON. Random weights, inputs of zeros and noise; bfloat16 matrices on a GPU, float32 on a CPU.
+"""
+
+import argparse
+import dataclasses
+import functools
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from roge_jax import config as presets
+from roge_jax import cost, model, sampling
+from roge_jax.config import RoGeConfig
+from roge_jax.core.params import Tree, flatten, unflatten
+from roge_jax.fusion import Condition
+from roge_jax.recon.vggt import encoder_grid
+from roge_jax.training import plan, stages
+from roge_jax.training.loop import initial_state
+from roge_jax.training.optim import make_optimiser
+from roge_jax.video import flow, solvers
+
+
+class Row(NamedTuple):
+    """One line of the table. Floor, "must" and "reach for" are goals for one H100 or H200, in seconds."""
+
+    group: str  # dit, train, vggt, rays, render, vae, sample, numerics
+    config: RoGeConfig
+    m: int
+    floor: float | None = None
+    must: float | None = None
+    reach: float | None = None
+    ladder: bool = False
+
+
+def sized(base: RoGeConfig, **changes) -> RoGeConfig:
+    return dataclasses.replace(base, **changes)
+
+
+def _ladder(width: int, depth: int) -> RoGeConfig:
+    mini = presets.preset("mini")
+    numbers = {"width": width, "heads": width // 64, "depth": depth, "ffn": 4 * width}
+    dit = dataclasses.replace(mini.dit, text_dim=64, text_len=16, **numbers)
+    return sized(mini, dit=dit)
+
+
+def rows() -> dict[str, Row]:
+    paper, mini, tiny = (presets.preset(name) for name in ("paper", "mini", "tiny"))
+    large = sized(paper, height=480, width=832)
+    shallow = sized(paper, dit=dataclasses.replace(paper.dit, depth=2))
+    views = {"recon_height": 512, "recon_width": 512, "frames": 9}
+    found = {
+        "DiT-14B forward, 192x336, M=6, N=81": Row("dit", paper, 6, 0.275, 0.38, 0.31),
+        "DiT-14B forward, 480x832, M=6, N=81": Row("dit", large, 6, 3.67, 4.6, 3.85),
+        "LoRA joint step, 192x336, batch 1": Row("train", paper, 6, 1.2, 2.9, 1.9),
+        "LoRA step, 480x832, reconstruction frozen": Row("train", large, 6, 12.3, 19.0, 15.0),
+        "VGGT-1B, 10 views at 336x518": Row(
+            "vggt", sized(paper, recon_height=336, recon_width=520), 10, 0.033, 0.080, 0.055
+        ),
+        "renderer 512x512, 2 views, per frame": Row(
+            "render", sized(paper, **views), 2, 0.0035, 1 / 90, 1 / 150
+        ),
+        "all 87 ray features, 288x504, M=6": Row("rays", paper, 6, 0.24, 0.50, 0.35),
+        "VAE decode, 81 frames, 480x832": Row("vae", large, 6, 0.69, 2.0, 1.0),
+        "81 frames, 50 steps, 192x336, everything included": Row("sample", paper, 6, 14.3, 20, 16),
+        "bfloat16 against float32: 2 blocks of DiT-14B, 192x336": Row("numerics", shallow, 6),
+    }
+    small = {
+        "ladder: DiT forward, width 128, 4 blocks": Row("dit", _ladder(128, 4), 3),
+        "ladder: DiT forward, width 256, 6 blocks": Row("dit", _ladder(256, 6), 3),
+        "ladder: DiT forward, width 384, 8 blocks": Row("dit", _ladder(384, 8), 3),
+        "ladder: LoRA joint step, tiny": Row("train", tiny, 3),
+        "ladder: VGGT, 3 views, mini": Row("vggt", mini, 3),
+        "ladder: renderer, 2 views, mini, per frame": Row("render", mini, 2),
+        "ladder: all ray features, mini, M=3": Row("rays", mini, 3),
+        "ladder: VAE decode, mini": Row("vae", mini, 3),
+        "ladder: 50 steps, everything included, tiny": Row("sample", tiny, 3),
+        "ladder: bfloat16 against float32, width 128": Row("numerics", _ladder(128, 4), 3),
+    }
+    return found | {name: row._replace(ladder=True) for name, row in small.items()}
+
+
+# ---- weights and inputs --------------------------------------------------------------------------
+
+
+def weights(specs: Tree, dtype: Any) -> Tree:
+    """Random leaves made of one short random vector: no time is spent on drawing billions of numbers."""
+    base = 0.02 * jax.random.normal(jax.random.key(0), (1 << 16,))
+
+    def fill(shape: tuple[int, ...], kind: Any) -> jax.Array:
+        n = int(np.prod(shape))
+        times = -(-n // base.size)
+        return (
+            jnp.broadcast_to(base.astype(kind)[None], (times, base.size))
+            .reshape(-1)[:n]
+            .reshape(shape)
+        )
+
+    make = jax.jit(fill, static_argnums=(0, 1))
+    flat = flatten(specs)
+    return unflatten(
+        {p: make(s.shape, jnp.float32 if cost.keeps_float32(p) else dtype) for p, s in flat.items()}
+    )
+
+
+def cameras(cfg: RoGeConfig, m: int, n: int) -> dict[str, jax.Array]:
+    K = jnp.array([[cfg.width, 0, cfg.width / 2], [0, cfg.width, cfg.height / 2], [0, 0, 1.0]])
+    c2w = jnp.tile(jnp.eye(4), (m + n, 1, 1)).at[:, 0, 3].set(jnp.arange(m + n) / (m + n))
+    return {"K": jnp.tile(K, (m + n, 1, 1)), "c2w": c2w}
+
+
+def photos(cfg: RoGeConfig, m: int) -> dict[str, jax.Array]:
+    return {
+        "vectors": jnp.zeros((m, 11)),
+        "context_rgb": jnp.full((m, cfg.height, cfg.width, 3), 0.5),
+        "context_recon": jnp.full((m, cfg.recon_height, cfg.recon_width, 3), 0.5),
+    }
+
+
+class Job(NamedTuple):
+    """`call()` once does what is timed, and waits for it; `flops` of it; calls make `frames` results."""
+
+    call: Callable[[], Any]
+    flops: float
+    compile_seconds: float
+    frames: int = 1
+    notes: dict[str, Any] | None = None
+
+
+def compiled(function: Callable, *arguments, flops: float, frames: int = 1) -> Job:
+    start = time.perf_counter()
+    run = jax.jit(function).lower(*arguments).compile()
+    seconds = time.perf_counter() - start
+    return Job(lambda: jax.block_until_ready(run(*arguments)), flops, seconds, frames)
+
+
+def job(row: Row, dtype: Any) -> Job:
+    """A row made ready: weights on the device, program compiled."""
+    cfg, m, n = row.config, row.m, row.config.frames
+    specs, (lh, lw), slots = model.specs(cfg), cfg.latent_size, cfg.slots(m)
+    tokens = cost.tokens_per_slot(cfg) * slots
+    size = (cfg.recon_height, cfg.recon_width)
+    grid = encoder_grid(cfg.encoder, *size)
+    views = cameras(cfg, m, n) | photos(cfg, m)
+    noise = jax.random.normal(jax.random.key(1), (slots, lh, lw, 16))
+
+    def pick(*names: str) -> Tree:
+        return weights({k: specs[k] for k in names if k in specs}, dtype)
+
+    if row.group == "dit":
+        params = pick("dit", "prompt")
+        text = jax.jit(functools.partial(model.text_cache, config=cfg))(params)
+        cond = Condition(jnp.zeros((slots, lh, lw, 20)), jnp.zeros((tokens, cfg.dit.width)))
+        forward = functools.partial(model.velocity, config=cfg, contexts=m)
+        return compiled(
+            lambda p, x, cond, text: forward(p, x, jnp.float32(0.5), cond, text=text),
+            *(params, noise, cond, text), flops=cost.velocity(cfg.dit, tokens),
+        )  # fmt: skip
+    if row.group == "vggt":
+        flops = cost.encoder(cfg.encoder, *size, m, cfg.renderer.width)
+        run = functools.partial(model.reconstruct, config=cfg)
+        return compiled(run, pick("encoder"), views, flops=flops)
+    z = jax.random.normal(jax.random.key(1), (m, grid[0] * grid[1], cfg.renderer.width))
+    if row.group == "rays":
+        flops = cost.renderer(cfg.renderer, *size, m * grid[0] * grid[1], m, m + n)
+        run = functools.partial(model.query_rays, config=cfg)
+        return compiled(run, pick("renderer"), z, views, flops=flops)
+    if row.group == "render":
+        targets = {"K": views["K"][m:], "c2w": views["c2w"][m:]}
+
+        def pictures(p, z, targets, views):
+            features = model.query_rays(p, z, targets, config=cfg, context=views)
+            return model.decode_rgb(p, features, config=cfg)
+
+        flops = n * cost.renderer_view(cfg.renderer, *size, m * grid[0] * grid[1])
+        return compiled(pictures, pick("renderer"), z, targets, views, flops=flops, frames=n)
+    if row.group == "vae":
+        run = functools.partial(sampling.decode, config=cfg, contexts=m)
+        flops = cost.vae_decode(cfg.vae, n, cfg.height, cfg.width)
+        return compiled(run, pick("vae"), noise, flops=flops)
+    if row.group == "sample":
+        return whole_video(cfg, m, pick(*specs), views, noise)
+    assert row.group == "train", row.group
+    return training_step(row, dtype)
+
+
+def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise: jax.Array) -> Job:
+    """As `python -m roge_jax.sample` does it: reconstruction, rays, encoding, 50 Euler steps, decoding, preview."""
+    start = time.perf_counter()
+    run = sampling.programs(params, views, cfg, "noised")
+    seconds = time.perf_counter() - start
+    sigmas = flow.schedule("shift", 50, shift=cfg.flow.shift)
+
+    def call():
+        prepared = run.prepare(params, views)
+        x = noise
+        for _, _, state in solvers.iterate(
+            "euler", lambda x, s: run.velocity(params, prepared, noise, x, s), noise, sigmas
+        ):
+            x = state
+        return jax.block_until_ready(
+            (run.decode(params, x), run.preview(params, prepared.features))
+        )
+
+    return Job(call, cost.estimate(cfg, m, 50).total_flops, seconds)
+
+
+def training_step(row: Row, dtype: Any) -> Job:
+    """One LoRA step with the policy that recomputes least of those that fit: loss, gradient, AdamW, state donated."""
+    cfg, m = row.config, row.m
+    hires = cfg.height > 192
+    stage = stages.lora_stage(100, frames=cfg.frames, hires=hires)
+    limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", 64e9)
+    needs, failed = {}, ""
+    for remat in ("none", "dots", "attention", "full"):
+        stage = dataclasses.replace(stage, remat=remat)
+        found = plan.plan(cfg, stage, m=m, dtype=dtype, fused_attention=dtype == jnp.bfloat16)
+        needs[remat] = found.bytes / 1e9
+        if found.bytes > 1.1 * limit:  # the estimate may be too high: near misses are tried
+            continue
+        try:
+            return _step(cfg, stage, m, dtype, found, needs)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" not in str(error):
+                raise
+            failed = remat
+    raise MemoryError(
+        f"no policy fits {limit / 1e9:.0f} GB; planned GB: {needs}"
+        + (f"; tried and failed: {failed}" if failed else "")
+    )
+
+
+def _step(cfg: RoGeConfig, stage: stages.Stage, m: int, dtype: Any, found: plan.Plan, needs) -> Job:
+    start = time.perf_counter()
+    specs, frozen_specs = stages.stage_specs(cfg, stage)
+    step, shapes = plan.abstract_step(cfg, stage, m, scenes=1, dtype=dtype)
+    run = jax.jit(step, donate_argnums=0).lower(*shapes).compile()
+    seconds = time.perf_counter() - start
+    frozen = weights(frozen_specs, dtype)
+    optimiser = make_optimiser(stage.optim, specs, stage.steps)
+    state = [initial_state(weights(specs, jnp.float32), optimiser, stage.optim)]
+    batch = {name: jnp.full(x.shape, 0.5) for name, x in shapes[2].items()}
+    batch |= {k: v[None] for k, v in cameras(cfg, m, cfg.frames).items()}
+
+    def call():
+        state[0], metrics = run(state[0], frozen, batch, jax.random.key(2))
+        return float(metrics["loss"])
+
+    call()  # the first allocation of everything: whether it fits shows here
+    return Job(call, found.flops, seconds, notes={"remat": stage.remat, "planned_gb": needs})
+
+
+# ---- measuring -----------------------------------------------------------------------------------
+
+
+def measure(call: Callable[[], Any], repeats: int, seconds: float) -> dict[str, Any]:
+    """Seconds per call after two calls to warm up: median and quartiles of `repeats`, fewer if `seconds` are over.
+
+    On a CPU these are CPU seconds: wall time measures the neighbours.
+    """
+    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
+    begin, taken = time.perf_counter(), []
+    for turn in range(repeats + 2):
+        start = clock()
+        call()
+        if turn >= 2:
+            taken.append(clock() - start)
+        if taken and time.perf_counter() - begin > seconds:
+            break
+    low, median, high = np.percentile(taken, [25, 50, 75])
+    return {"seconds": float(median), "quartiles": [float(low), float(high)], "calls": len(taken)}
+
+
+def ours(row: Row, repeats: int, seconds: float) -> dict[str, Any]:
+    """The measured row: seconds, compile seconds, TFLOP/s, peak memory."""
+    dtype = jnp.bfloat16 if jax.default_backend() == "gpu" else jnp.float32
+    if row.group == "numerics":
+        return numerics(row)
+    work = job(row, dtype)
+    found = measure(work.call, repeats, seconds)
+    found["seconds"] /= work.frames
+    found["quartiles"] = [x / work.frames for x in found["quartiles"]]
+    found |= {
+        "flops": work.flops / work.frames,
+        "compile_seconds": work.compile_seconds,
+    } | (work.notes or {})
+    found["tflops"] = found["flops"] / found["seconds"] / 1e12
+    stats = jax.local_devices()[0].memory_stats() or {}
+    if "peak_bytes_in_use" in stats:  # of this process, which ran nothing else
+        found["peak_gb"] = stats["peak_bytes_in_use"] / 1e9
+    return found
+
+
+def numerics(row: Row) -> dict[str, Any]:
+    """Relative L2 difference of the fast path (bfloat16 matrices, fused attention) from float32 throughout."""
+    cfg, m = row.config, row.m
+    specs = {k: v for k, v in model.specs(cfg).items() if k in ("dit", "prompt")}
+    tokens = cost.tokens_per_slot(cfg) * cfg.slots(m)
+    shape = (cfg.slots(m), *cfg.latent_size)
+    noise = jax.random.normal(jax.random.key(1), (*shape, 16))
+    tokens_in = jax.random.normal(jax.random.key(2), (tokens, cfg.dit.width))
+    results = []
+    for dtype in (jnp.float32, jnp.bfloat16):
+        with jax.default_matmul_precision("highest" if dtype == jnp.float32 else "default"):
+            run = jax.jit(functools.partial(model.velocity, config=cfg, contexts=m))
+            cond = Condition(jnp.zeros((*shape, 20)), tokens_in)
+            out = run(weights(specs, dtype), noise, jnp.float32(0.5), cond)
+            results.append(np.asarray(out, np.float64))
+    exact, fast = results
+    return {"relative_error": float(np.linalg.norm(fast - exact) / np.linalg.norm(exact))}
+
+
+def forward_flops(row: Row) -> float:
+    """Of the transformer, for the peer."""
+    tokens = cost.tokens_per_slot(row.config) * row.config.slots(row.m)
+    return cost.velocity(row.config.dit, tokens)
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__)
+    p.add_argument("--row", required=True)
+    p.add_argument("--side", choices=("ours", "peer"), required=True)
+    p.add_argument("--out", type=Path, required=True)
+    p.add_argument("--repeats", type=int, default=10)
+    p.add_argument("--seconds", type=float, default=600.0)
+    args = p.parse_args()
+    row = rows()[args.row]
+    try:
+        if args.side == "ours":
+            found = ours(row, args.repeats, args.seconds)
+        else:
+            import peer
+
+            found = peer.run(row, args.repeats, args.seconds)
+        found = {"status": "measured"} | found
+    except MemoryError as error:
+        found = {"status": "out of memory", "why": str(error)}
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        found = {"status": "out of memory", "why": str(error).splitlines()[0][:300]}
+    args.out.write_text(json.dumps(found))
+
+
+if __name__ == "__main__":
+    main()
