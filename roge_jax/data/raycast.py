@@ -320,10 +320,11 @@ def render(
         rays = _fence(*_rays(K, c2w, column + 0.5, row + top + 0.5))
         return total, _trace(scene, origin, rays)[0]
 
-    # Channels are joined outside the loop: a concatenation fused with its producers computes every
-    # one of them again for every element (150 times slower).
+    # Channels are added up: a concatenation would be fused with its producers and compute every one
+    # of them again for every element (with one strip and one sample 20 times slower, unoptimised 600).
     total, depth = jax.lax.map(strip, jnp.arange(strips) * float(rows))
-    rgb = jnp.stack(total, -1) / supersample**2
+    parts = zip(total, jnp.eye(3), strict=True)
+    rgb = sum(x[..., None] * unit[None, None] for x, unit in parts) / supersample**2
     return {
         "rgb": rgb.reshape(strips * rows, width, 3)[:height],
         "depth": depth.reshape(strips * rows, width)[:height],
