@@ -1,6 +1,7 @@
 """Speed against accuracy of the trained model: every sampler on every schedule, then its other knobs and its peers.
 
     python experiments/mini_quality.py [--scenes 8] [--checkpoint mini]
+    python experiments/mini_quality.py --scenes 2 --solvers euler ab2 --budgets 4 8 --reference 16    # a quick look
 
 Writes results/mini_quality.json, mini_quality.png (samplers), mini_knobs.png (photos, size, precision, caches, peers) and the
 tables between the markers in docs/solvers.md. All points of a run share scenes (held-out split), photos and noise.
@@ -18,6 +19,7 @@ import argparse
 import json
 import os
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -48,25 +50,24 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "solvers.md"
 SCHEDULES = ("uniform", "shift", "graded", "optimised")
 BUDGETS = (2, 4, 6, 8, 12, 20)
 TOLERANCES = (0.3, 0.1, 0.03)
-REFERENCE_STEPS = 64
 GOALS = ((8, 0.1), (4, 0.5))  # evaluations, dB
 SAME_SHARPNESS = 0.02  # relative
 
 
-def points(model: str):
+def points(model: str, names: list[str], budgets: list[int]):
     """(solver, schedule, steps) of the sweep."""
     stored = flow.optimised_grids(model)
-    for solver in ALL_SOLVERS:
-        steps = sorted({n for b in BUDGETS if (n := most_steps(solver, b))})
+    for solver in names:
+        steps = sorted({n for b in budgets if (n := most_steps(solver, b))})
         for schedule in SCHEDULES:
             for n in stored.get(solver, {}) if schedule == "optimised" else steps:
                 yield solver, schedule, n
 
 
-def sweep(sampler: Sampler, judge: Judge) -> tuple[list[dict], dict[str, Any]]:
+def sweep(sampler: Sampler, judge: Judge, args) -> tuple[list[dict], dict[str, Any]]:
     """(records, what they are compared with)"""
     config = sampler.config
-    fine = [flow.schedule("graded", n) for n in (REFERENCE_STEPS // 2, REFERENCE_STEPS)]
+    fine = [flow.schedule("graded", n) for n in (args.reference // 2, args.reference)]
     half, full = (sampler.run("rk4", grid).latents for grid in fine)
     base: dict[str, Any] = {"reference": full, "frames": judge.frames(full)}
     base["self_error"] = judge.against(half, judge.frames(half), full, base["frames"])
@@ -94,7 +95,7 @@ def sweep(sampler: Sampler, judge: Judge) -> tuple[list[dict], dict[str, Any]]:
             }
         )
 
-    for solver, schedule, steps in points(config.name):
+    for solver, schedule, steps in points(config.name, args.solvers, args.budgets):
         add(solver, schedule, steps, sampler.run(solver, sampler.grid(schedule, steps, solver)))
         print(solver, schedule, steps, f"{records[-1]['metrics']['latent_error']['mean']:.4f}", flush=True)  # fmt: skip
     for tolerance in TOLERANCES:
@@ -147,7 +148,7 @@ def main(args: argparse.Namespace) -> None:
     clock = time.perf_counter()
     judge.frames(scenes.noise[:, scenes.m :])
     decode_seconds = (time.perf_counter() - clock) / args.scenes
-    records, base = sweep(sampler, judge)
+    records, base = sweep(sampler, judge, args)
     euler50 = summary(base["euler50"])
 
     run = knobs.default_run(sampler)
@@ -181,10 +182,11 @@ def main(args: argparse.Namespace) -> None:
             "weights": weights,
             "schedules_found_on": found or "none",
             "schedules_are_of_these_weights": found == weights,
+            "command": " ".join(["python experiments/mini_quality.py", *sys.argv[1:]]),
             "scenes": [seeds[0], seeds[-1]],
             "photos": DEFAULT_M,
             "size": [config.height, config.width, config.frames],
-            "reference": f"rk4, {REFERENCE_STEPS} graded steps",
+            "reference": f"rk4, {args.reference} graded steps",
             "metrics": MEANING,
         },
         "device": f"{jax.devices()[0].device_kind}, {len(os.sched_getaffinity(0))} cores",
@@ -230,6 +232,9 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--checkpoint", default="mini")
     parser.add_argument("--scenes", type=int, default=8)
+    parser.add_argument("--solvers", nargs="+", default=list(ALL_SOLVERS), choices=ALL_SOLVERS)
+    parser.add_argument("--budgets", nargs="+", type=int, default=list(BUDGETS))
+    parser.add_argument("--reference", type=int, default=64, help="steps of the reference")
     parser.add_argument("--draw", action="store_true", help="charts and tables from the JSON alone")
     chosen = parser.parse_args()
     if chosen.scenes < 2:

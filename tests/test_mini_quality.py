@@ -95,6 +95,7 @@ def test_tables_replace_only_what_lies_between_the_markers():
     records = [point("ab2", 4, 0.05, 0.3, 0.48), point("ab2", 8, 0.01, 0.05, 0.5)]
     report = {
         "settings": {
+            "command": "python experiments/mini_quality.py",
             "scenes": [5, 6],
             "photos": 3,
             "weights": "abc",

@@ -206,7 +206,7 @@ def test_program_agrees_with_the_model_file(weights, photos):
     context, target, info = normalise(photos.cameras, path)
     views = sampling.window_views(photos.images, None, context, target, info, CONFIG)
     noise = sampling.draw_noise(0, 0, 4, CONFIG)
-    grid = sampling.flow.schedule("shift", 2)
+    grid = sampling.flow.schedule(SETTINGS.schedule, 2)
 
     @jax.jit
     def plain(params, views, noise):
@@ -409,7 +409,7 @@ def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
         == 0
     )
     shown = capsys.readouterr().out
-    assert said in shown and "velocity, each of 12" in shown and "peak memory" in shown
+    assert said in shown and f"velocity, each of {sampling.STEPS}" in shown and "peak memory" in shown
     assert not any(tmp_path.iterdir())
 
 

@@ -217,10 +217,9 @@ def with_tables(text: str, report: Report) -> str:
 def tables(report: Report) -> str:
     """The measured numbers as Markdown."""
     s, euler = report["settings"], report["euler50"]
-    count = s["scenes"][1] - s["scenes"][0] + 1
     number = lambda v, d=2: f"{v['mean']:.{d}f} ({v['low']:.{d}f} .. {v['high']:.{d}f})"  # noqa: E731
     lines = [
-        f"`python experiments/mini_quality.py --scenes {count}`: held-out procedural scenes {s['scenes'][0]} .. {s['scenes'][1]}, "
+        f"`{s['command']}`: held-out procedural scenes {s['scenes'][0]} .. {s['scenes'][1]}, "
         f"{s['photos']} photos, weights {s['weights']}, schedules found on {s['schedules_found_on']}, "
         f"{report['device']}, {report['seconds']:.0f} s in all. Mean (95 % bootstrap interval over scenes).",
         "",
