@@ -1,27 +1,31 @@
 """What `train --dry-run` says a LoRA step holds, beside what XLA allocates for it, on the `tiny` and `mini` presets.
 
-    python experiments/memory_check.py         about 5 minutes on one quiet core; nothing is trained, only compiled
+    python experiments/memory_check.py         about 6 minutes on one quiet core; nothing is trained, only compiled
 
 XLA's figures are `compiled.memory_analysis()`: arguments and temporary memory, once with operations in one order, as
 on a GPU, and once with a CPU's own schedule, which runs independent operations side by side and keeps more alive.
-LLVM's optimisation is off (it changes the code of kernels, not the buffers). M = 3 photos, batch 1, float32.
-Writes experiments/results/memory_check.json.
+LLVM's optimisation is off (it changes the code of kernels, not the buffers). M = 3 photos, batch 1, float32. Every
+case compiles in a process of its own. Writes experiments/results/memory_check.json.
 """
 
+import argparse
 import dataclasses
 import json
 import os
+import subprocess
 import sys
-import time
 from pathlib import Path
 
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0"
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 RESULT = HERE / "results" / "memory_check.json"
-CASES = (("tiny", "dots"), ("mini", "dots"), ("mini", "full"), ("mini", "none"))
-SCHEDULES = {"in order": False, "side by side": True}
+CASES = (
+    "tiny,dots,in-order",
+    "mini,dots,in-order",
+    "mini,full,in-order",
+    "tiny,dots,side-by-side",
+    "mini,dots,side-by-side",
+)
 M = 3
 
 
@@ -33,52 +37,54 @@ def check(name: str, remat: str) -> dict:
 
     cfg = config.preset(name)
     stage = dataclasses.replace(stages.lora_stage(10, frames=cfg.frames), remat=remat)
-    start = time.process_time()
     found = plan.plan(cfg, stage, m=M)
-    planning = time.process_time() - start
     step, arguments = plan.abstract_step(cfg, stage, M, scenes=1)
+    # Weights that a step does not read (the VAE's decoder) still lie on the device.
     lowered = jax.jit(step, donate_argnums=0, keep_unused=True).lower(*arguments)
-    row = {
-        "preset": name,
-        "remat": remat,
+    used = lowered.compile().memory_analysis()
+    total = used.argument_size_in_bytes + used.temp_size_in_bytes
+    activations = found.memory["activations and gradients"]
+    return {
         "planned": found.memory,
-        "planning_cpu_seconds": planning,
+        "arguments": used.argument_size_in_bytes,
+        "temporary": used.temp_size_in_bytes,
+        "planned_over_xla": {
+            "all": found.bytes / total,
+            "temporary": activations / used.temp_size_in_bytes,
+        },
     }
-    for schedule, concurrent in SCHEDULES.items():
-        options = {"xla_cpu_enable_concurrency_optimized_scheduler": concurrent}
-        used = lowered.compile(compiler_options=options).memory_analysis()
-        total = used.argument_size_in_bytes + used.temp_size_in_bytes
-        activations = found.memory["activations and gradients"]
-        row[schedule] = {
-            "arguments": used.argument_size_in_bytes,
-            "temporary": used.temp_size_in_bytes,
-            "planned_over_xla": {
-                "all": found.bytes / total,
-                "temporary": activations / used.temp_size_in_bytes,
-            },
-        }
-    return row
+
+
+def child(case: str) -> dict:
+    """`check` in a process whose XLA follows the schedule of the case."""
+    side_by_side = str(case.endswith("side-by-side")).lower()
+    flags = "--xla_backend_optimization_level=0 "
+    flags += f"--xla_cpu_enable_concurrency_optimized_scheduler={side_by_side}"
+    settings = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, __file__, "--case", case]
+    said = subprocess.run(command, env=settings, capture_output=True, text=True, check=True)
+    return json.loads(said.stdout.splitlines()[-1])
 
 
 def main() -> None:
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    p.add_argument("--case", choices=CASES, help=argparse.SUPPRESS)
+    args = p.parse_args()
+    if args.case:
+        return print(json.dumps(check(*args.case.split(",")[:2])))
     from roge_jax.entry import environment
 
-    rows = []
-    for name, remat in CASES:
-        rows.append(check(name, remat))
-        print(json.dumps(rows[-1]), flush=True)
+    rows: dict[str, dict] = {}
+    print("| case | planned, MB | XLA, MB | all | temporary alone |\n|---|---|---|---|---|")
+    for case in CASES:
+        x = rows[case] = child(case)
+        xla, ratio = (x["arguments"] + x["temporary"]) / 1e6, x["planned_over_xla"]
+        print(
+            f"| {case.replace(',', ', ')} | {sum(x['planned'].values()) / 1e6:.1f} | {xla:.1f} | "
+            f"{ratio['all']:.2f} | {ratio['temporary']:.2f} |",
+            flush=True,
+        )
         RESULT.write_text(json.dumps({"environment": environment(), "rows": rows}, indent=1) + "\n")
-    print(
-        "| preset, remat | schedule | planned, MB | XLA, MB | all | temporary alone |\n|---|---|---|---|---|---|"
-    )
-    for row in rows:
-        for schedule in SCHEDULES:
-            x = row[schedule]
-            xla, ratio = (x["arguments"] + x["temporary"]) / 1e6, x["planned_over_xla"]
-            print(
-                f"| {row['preset']}, {row['remat']} | {schedule} | {sum(row['planned'].values()) / 1e6:.1f} | "
-                f"{xla:.1f} | {ratio['all']:.2f} | {ratio['temporary']:.2f} |"
-            )
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from .config import RoGeConfig
 from .core.lora import attach, lora_specs
 from .core.params import Spec, Tree, flatten, unflatten, zeros
 from .core.params import init as init_specs
-from .core.sharding import batch_axes, current
+from .core.sharding import over_scenes
 from .fusion import Condition
 from .geometry.rays import plucker
 from .recon import ray_scene, vggt
@@ -158,7 +158,6 @@ def query_rays(
     )
 
 
-@jax.named_scope("picture")
 def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """The reconstruction's own picture [v, recon_height, recon_width, 3] of ray features."""
     return ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=config.renderer)
@@ -167,21 +166,16 @@ def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.
 # Generation (Sec. 3.2).
 
 
-@jax.named_scope("vae")
 def encode_contexts(params: Tree, context_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """X^S [m, lh, lw, 16]: every photo encoded alone, as a video of one frame."""
     return vae.encode_frames(params["vae"], 2.0 * context_rgb - 1.0, cfg=config.vae)
 
 
-@jax.named_scope("vae")
 def encode_targets(params: Tree, target_rgb: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """X^T [1 + (n - 1) / 4, lh, lw, 16]: the target video through the causal VAE, in chunks of time if it is large."""
-    large = vae.largest_map(target_rgb.shape, config.vae) > vae.SINGLE_PASS_BYTES
-    encode = vae.encode_chunked if large else vae.encode
-    return encode(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
+    return vae.encode_any(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
 
 
-@jax.named_scope("vae")
 def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax.Array:
     """Target latents [t, lh, lw, 16] -> video [n, h, w, 3] in [0, 1]."""
     return jnp.clip(0.5 + 0.5 * vae.decode(params["vae"], latents, cfg=config.vae), 0.0, 1.0)
@@ -244,7 +238,6 @@ def velocity(
     )
 
 
-@jax.named_scope("transformer")
 def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
     """Cross-attention keys and values of the prompt, the same at every sampling step; None without text."""
     if not config.dit.text_len:
@@ -340,17 +333,6 @@ def scene_loss(
         ),
         "photometric": photometric(params, features, views, config=config),
     }
-
-
-def over_scenes(f: Callable, *batch):
-    """f(*scene) of every scene of a batch (leading axis of every array): all at once, or one by one on a lone CPU.
-
-    One scene's matrix products fill a CPU, and the gradients of batched products are slow there (see `matmul`).
-    """
-    if jax.default_backend() == "cpu" and current() is None:
-        return jax.lax.map(lambda scene: f(*scene), batch)
-    scenes = jax.tree.leaves(batch)[0].shape[0]
-    return jax.vmap(f, spmd_axis_name=batch_axes(scenes))(*batch)
 
 
 def loss(

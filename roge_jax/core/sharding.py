@@ -334,3 +334,14 @@ def by_heads(
         return constrain(q, ("tokens", None, None)), constrain(k, whole), constrain(v, whole)
     split = (None, "attention_heads", None)
     return constrain(q, split), constrain(k, split), constrain(v, split)
+
+
+def over_scenes(f: Callable, *batch):
+    """f(*scene) of every scene of a batch (leading axis of every array): all at once, or one by one on a lone CPU.
+
+    One scene's matrix products fill a CPU, and the gradients of batched products are slow there (see `matmul`).
+    """
+    if jax.default_backend() == "cpu" and current() is None:
+        return jax.lax.map(lambda scene: f(*scene), batch)
+    scenes = jax.tree.leaves(batch)[0].shape[0]
+    return jax.vmap(f, spmd_axis_name=batch_axes(scenes))(*batch)

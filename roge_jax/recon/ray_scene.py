@@ -344,6 +344,7 @@ def shared_levels(p, z, plucker, *, cfg, rays, cameras):
     return levels, z
 
 
+@jax.named_scope("picture")
 def decode_rgb(p: Tree, features: jax.Array, *, cfg: RendererConfig) -> jax.Array:
     """Ray features [v, gh, gw, d] -> RGB [v, h, w, 3] in (0, 1)."""
     v, gh, gw, d = features.shape

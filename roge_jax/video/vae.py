@@ -309,11 +309,13 @@ def encode_moments(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     return linear(p["quant"], encoder(p["encoder"], video, None, cfg=cfg)[0])
 
 
+@jax.named_scope("vae")
 def encode(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """Video [t, h, w, 3] in [-1, 1] -> normalised latents [t', h/8, w/8, c] (the mean, no sampling)."""
     return normalise(encode_moments(p, video, cfg=cfg)[..., : cfg.latent], cfg=cfg)
 
 
+@jax.named_scope("vae")
 def decode(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """Normalised latents [t', lh, lw, c] -> video [t, 8 lh, 8 lw, 3], not clamped to [-1, 1]."""
     return decode_raw(p, denormalise(latents, cfg=cfg), cfg=cfg)
@@ -339,6 +341,7 @@ def largest_map(shape: tuple[int, ...], cfg: VAEConfig) -> float:
     return 4.0 * float(np.prod(shape[:3])) * cfg.base
 
 
+@jax.named_scope("vae")
 def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`encode` one latent frame at a time: the same latents in memory that does not grow with the clip."""
     if video.shape[0] == 1:
@@ -355,6 +358,13 @@ def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     return normalise(moments[..., : cfg.latent], cfg=cfg)
 
 
+def encode_any(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
+    """`encode`, or `encode_chunked` where a single pass would take too much memory."""
+    large = largest_map(video.shape, cfg) > SINGLE_PASS_BYTES
+    return (encode_chunked if large else encode)(p, video, cfg=cfg)
+
+
+@jax.named_scope("vae")
 def decode_chunked(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`decode` one latent frame at a time."""
     if latents.shape[0] == 1:
