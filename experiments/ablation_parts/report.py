@@ -8,6 +8,7 @@ from roge_jax.metrics.report import bootstrap
 
 from .common import SIGMAS
 from .generator import FINETUNES
+from .reconstruction import VARIANTS
 
 
 def difference(rows: dict[str, dict], name: str) -> dict[str, float]:
@@ -93,6 +94,7 @@ def tables(rows: dict[str, dict]) -> str:
             )
     if "lora" in rows:
         row = rows["lora"]
+        lines += ["", f"LoRA, {row['steps']} steps, {len(row['losses']['0']['flow'])} scenes:"]
         lines += ["", "| layers | matrices | stable rank | rank of 90 % | of 99 % of the energy |"]
         lines += ["|---|---|---|---|---|"]
         for family, s in row["spectrum"].items():
@@ -113,6 +115,9 @@ def tables(rows: dict[str, dict]) -> str:
                 f"| {label} | {np.mean(loss['flow']):.4f} | {change if name != str(row['rank']) else ''} | "
                 f"{1000 * np.mean(loss['photometric']):.3f} |"
             )
+    missing = [n for n in (*VARIANTS, "conditions", "finetune", "lora") if n not in rows]
+    if missing:
+        lines += ["", f"Not run yet: {', '.join(missing)}."]
     return "\n".join(lines)
 
 
