@@ -75,6 +75,7 @@ def calibrate(engine: Engine, scenes: int) -> None:
     origin |= {
         "seeds": [TRAIN_SEED, TRAIN_SEED + scenes - 1],
         "model": "the shipped mini",
+        "full": [engine.settings.solver, engine.settings.schedule, engine.settings.steps],
         "full_to_truth": float(np.mean([row["full_to_truth"] for row in rows])),
         "head_to_truth": float(np.mean([row["head_to_truth"] for row in rows])),
     }
@@ -120,13 +121,13 @@ def uniform_plan(engine: Engine, scene: LadderScene, listed: list, budget: float
     """Photos and steps cut by one factor; without generation where that costs too much."""
     price = options.Prices(scene.photos, engine.config, engine.settings, 1)
     found = []
-    for twelfths in range(1, engine.settings.steps + 1):
-        m = max(1, round(twelfths * CONTEXTS / engine.settings.steps))
+    for steps in range(1, engine.settings.steps + 1):
+        m = max(1, round(steps * CONTEXTS / engine.settings.steps))
         spread = tuple(int((i + 0.5) * CONTEXTS / m) for i in range(m))
-        made = engine.choices(scene, photos=spread, steps=twelfths, schedule="uniform")
-        found += [(twelfths + 100, price(made, twelfths), made)]
+        made = engine.choices(scene, photos=spread, steps=steps, schedule="uniform")
+        found += [(steps + 100, price(made, steps), made)]
         head = engine.choices(scene, photos=spread, generate=(False,))
-        found += [(twelfths, price(head, 0), head)]
+        found += [(steps, price(head, 0), head)]
     affordable = [f for f in found if f[1] <= budget] or [min(found, key=lambda f: f[1])]
     return max(affordable, key=lambda f: f[0])[1:]
 

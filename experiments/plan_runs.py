@@ -192,20 +192,18 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 
 # ---- calibration -----------------------------------------------------------------------------------
 
-WAYS = [("unipc_2", "shift", k) for k in (2, 3, 4, 6, 8)]
-WAYS += [("ab2", "shift", 2), ("ab2", "shift", 4), ("unipc_2", "uniform", 4)]
-BASE = {
-    "steps": 4
-}  # at which photos, tokens and size are compared: their effect, not that of few steps
+WAYS = [("ab2", "uniform", k) for k in (2, 3, 4, 6)]
+WAYS += [("unipc_2", "uniform", k) for k in (1, 2, 3, 4)] + [("unipc_2", "shift", 4)]
+BASE = {"steps": 4}  # where photos, tokens and size are compared: their effect, not that of steps
 
 
 def stored_ways(name: str) -> list[tuple[str, str, int]]:
-    """Optimised schedules of the model, at most 8 evaluations."""
+    """Optimised schedules of the model, at most 6 evaluations."""
     return [
         (solver, "optimised", steps)
         for solver, grids in flow.optimised_grids(name).items()
         for steps in grids
-        if solvers.nfe(solver, steps) <= 8
+        if solvers.nfe(solver, steps) <= 6
     ]
 
 

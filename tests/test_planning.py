@@ -197,6 +197,8 @@ def test_explain_tells_what_was_bought_and_what_was_not(make):
     assert f"predicted error {plan.predicted_error:.4f}" in text
     assert "not for 'tiny'" not in text
     assert "for 'mini', not for 'tiny'" in make(0.05, table=None, probe=0.0).explain()
+    other = dataclasses.replace(TABLE, provenance={"full": ["euler", "shift", 50]})
+    assert "against 50 steps of euler (shift)" in make(0.05, table=other, probe=0.0).explain()
 
 
 def test_prices_are_those_of_the_cost_model(make):

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .. import cost
 from ..config import RoGeConfig
 from ..core.params import Tree
 from ..data.scene import Scene, select_context
@@ -64,8 +65,8 @@ class Plan:
         part = self.predicted_cost / self.full_cost
         lines = [
             f"plan for tolerance {self.tolerance:g}: predicted error {self.predicted_error:.4f} (RMS colour against the "
-            f"full model), {self.predicted_cost / 1e9:,.1f} GFLOP of {self.full_cost / 1e9:,.1f} ({100 * part:.0f} %), "
-            f"{self.planning_cost / 1e9:,.1f} for planning",
+            f"full model), {cost.scaled(self.predicted_cost, 'FLOP')} of {cost.scaled(self.full_cost, 'FLOP')} "
+            f"({100 * part:.0f} %), {cost.scaled(self.planning_cost, 'FLOP')} for planning",
             f"  {_named(self.choices)}",
         ]
         lines += [f"  {'bought' if i else 'start '}  {_line(p)}" for i, p in enumerate(self.bought)]
@@ -78,7 +79,7 @@ class Plan:
 
 
 def _line(p: Purchase) -> str:
-    return f"{p.flops / 1e9:8.1f} GFLOP  {-p.gain:+.4f}  {p.what}: {p.reason}"
+    return f"{cost.scaled(p.flops, 'FLOP'):>11s}  {-p.gain:+.4f}  {p.what}: {p.reason}"
 
 
 def plan(
@@ -133,6 +134,12 @@ def plan(
     if chosen.error > tolerance:
         notes.append(
             f"max_cost {max_cost:.4g} FLOPs does not buy tolerance {tolerance:g}; this is the best within it."
+        )
+    against = table.provenance.get("full")
+    if against and against != [settings.solver, settings.schedule, settings.steps]:
+        notes.append(
+            f"errors of fewer steps were measured against {against[2]} steps of {against[0]} ({against[1]}), not against "
+            "these settings."
         )
     if table.name != config.name:
         notes.append(
