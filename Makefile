@@ -9,7 +9,7 @@ BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
 CODE := roge_jax tests experiments
-PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal -q
+PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help
 .PHONY: help sample train evaluate smoke test test-slow test-parity check lint format figures notebook clean

@@ -47,8 +47,24 @@ def pytest_configure(config):
     settings.load_profile("roge")
 
 
+# Files by the time they take, longest first: `make test` deals out whole files, so that nothing is compiled twice.
+LONGEST = (
+    "model",
+    "procedural",
+    "vae",
+    "readme",
+    "sample",
+    "notebooks",
+    "dit",
+    "solvers",
+    "sharding",
+)
+
+
 def pytest_collection_modifyitems(config, items):
-    """Leave out `slow` and `parity` tests unless a mark expression or a node id asks for them."""
+    """Longest files first. Leave out `slow` and `parity` tests unless a mark expression or a node id asks for them."""
+    rank = {f"test_{name}": i for i, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
     if config.option.markexpr or any("::" in str(arg) for arg in config.invocation_params.args):
         return
     chosen, left = [], []
