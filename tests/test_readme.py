@@ -1,4 +1,8 @@
-"""The commands and the Python of the README run as they are printed, with fewer steps and scenes."""
+"""The commands and the Python of the README run as they are printed, with fewer steps and scenes.
+
+Among the fast tests `sample` runs with the shipped model; of `evaluate` and `train`, which compile longer, only the
+options are read: test_evaluate.py and test_train_program.py run them on a tiny model. The slow tests run all of them.
+"""
 
 import os
 import re
@@ -10,12 +14,15 @@ from pathlib import Path
 import pytest
 from scene_files import nerfstudio, truth
 
+from roge_jax import entry, evaluate, train
+
 README = (Path(__file__).parents[1] / "README.md").read_text()
 SHORTER = {  # later options win
     "roge_jax.sample": ["--steps", "2", "--frames", "9"],
     "roge_jax.evaluate": ["--steps", "2", "--scenes", "procedural:1000000000"],
     "roge_jax.train": ["--steps", "1", "--out", "runs/readme"],
 }
+LONG = {"roge_jax.evaluate": evaluate, "roge_jax.train": train}
 
 
 def blocks(language: str) -> list[str]:
@@ -28,7 +35,7 @@ def commands() -> list[str]:
 
 
 def run(arguments, folder) -> subprocess.CompletedProcess:
-    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    environment = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
     return subprocess.run(
         [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True
     )
@@ -45,7 +52,23 @@ def test_the_readme_has_commands():
     assert len(commands()) >= 4 and len(blocks("python")) == 1
 
 
-@pytest.mark.parametrize("line", commands(), ids=lambda line: line.split()[2])
+def takes_long(line: str) -> bool:
+    return line.split()[2] in LONG
+
+
+@pytest.mark.parametrize(
+    "line", list(filter(takes_long, commands())), ids=lambda line: line.split()[2]
+)
+def test_options_are_understood(line):
+    _, _, module, *rest = shlex.split(line)
+    entry.parse(LONG[module].parser(), rest)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [pytest.param(line, marks=[pytest.mark.slow] * takes_long(line)) for line in commands()],
+    ids=[line.split()[2] for line in commands()],
+)
 def test_command_runs(line, folder):
     _, _, module, *rest = shlex.split(line)
     done = run(["-m", module, *rest, *SHORTER.get(module, [])], folder)
