@@ -54,6 +54,15 @@ class TestProgram:
         assert program.peak(few).bytes == program.peak(many).bytes > 64 * 32 * 4
         assert program.flops(many)[""] == 10 * program.flops(few)[""] == 30 * 2 * 2 * 64 * 32 * 32
 
+    def test_the_fused_attention_of_gpus_is_counted(self):
+        q, k = array(1, 7, 2, 8), array(1, 5, 2, 8)
+        for name, products in (("fwd", 2), ("bwd", 5)):
+            op = program.Op(
+                f"dot_product_attention_{name}_wrapper", (0, 1, 2), (3,), {}, (q, k, k), ""
+            )
+            one = program.Program([op], (0, 1, 2), (3,), [q, k, k, q])
+            assert program.flops(one) == {"": 2.0 * products * 7 * 5 * 2 * 8}
+
     @pytest.mark.parametrize("remat", ["none", "full"])
     def test_gradients_of_a_deep_network_as_xla_allocates_them(self, remat):
         def block(x, w):

@@ -138,20 +138,28 @@ def flops(program: Program, label: Callable[[str], str] = lambda scope: "") -> d
             for body in op.bodies:
                 for name, value in flops(body, label).items():
                     total[name] = total.get(name, 0.0) + turns * value
-        elif op.name in ("dot_general", "conv_general_dilated"):
-            out = math.prod(program.values[op.writes[0]].shape)
+            continue
+        value = _flops(op, program.values[op.writes[0]])
+        if value:
             name = label(op.scope)
-            total[name] = total.get(name, 0.0) + 2.0 * out * _terms(op)
+            total[name] = total.get(name, 0.0) + value
     return total
 
 
-def _terms(op: Op) -> float:
-    """Products that are added up for one number of the result."""
+def _flops(op: Op, out: Any) -> float:
     if op.name == "dot_general":
         (contracted, _), _ = op.params["dimension_numbers"]
-        return math.prod(op.shapes[0].shape[i] for i in contracted)
-    kernel = op.shapes[1].shape
-    return math.prod(kernel) / kernel[op.params["dimension_numbers"].rhs_spec[0]]
+        terms = math.prod(op.shapes[0].shape[i] for i in contracted)
+        return 2.0 * math.prod(out.shape) * terms
+    if op.name == "conv_general_dilated":
+        kernel = op.shapes[1].shape
+        terms = math.prod(kernel) / kernel[op.params["dimension_numbers"].rhs_spec[0]]
+        return 2.0 * math.prod(out.shape) * terms
+    if "dot_product_attention" in op.name:  # the fused kernel: two products, five of its gradient
+        b, length, heads, width = op.shapes[0].shape
+        products = 5 if "bwd" in op.name else 2
+        return 2.0 * products * b * length * op.shapes[1].shape[1] * heads * width
+    return 0.0
 
 
 def _bodies(name: str, params: dict[str, Any]) -> list[Any]:
