@@ -305,7 +305,7 @@ def test_bad_requests_name_what_is_allowed(tmp_path):
 
 
 def test_pool_round_trip_resume_and_guards(tmp_path):
-    size = {"frames": 2, "height": 8, "width": 12}
+    size = {name: SMALL[name] for name in ("frames", "height", "width")}  # compiled already
     options = {"supersample": 1, "scenes_per_shard": 2, "depth": True}
     write_pool(tmp_path, range(3), **size, processes=1, **options)
     pool = read_pool(tmp_path)
@@ -327,7 +327,7 @@ def test_pool_round_trip_resume_and_guards(tmp_path):
     stamps = {p: p.stat().st_mtime_ns for p in tmp_path.glob("shard*")}
     write_pool(tmp_path, range(3), **size, **options)  # nothing is missing: nothing is rendered
     assert stamps == {p: p.stat().st_mtime_ns for p in tmp_path.glob("shard*")}
-    with pytest.raises(UserError, match="frames 2"):
+    with pytest.raises(UserError, match="frames 5"):
         write_pool(tmp_path, range(3), **size | {"frames": 4}, **options)
     (tmp_path / "shard_00000.npz").unlink()  # as if the writer had died before the last rename
     missing = _missing(tmp_path, np.arange(3), {"scenes_per_shard": 2})
