@@ -34,7 +34,9 @@ def resident() -> float:
 
 
 def peak() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0
+    """The most this program had in memory. (`ru_maxrss` would start from that of the process that started it.)"""
+    status = Path("/proc/self/status").read_text().splitlines()
+    return 1024.0 * int(next(line for line in status if line.startswith("VmHWM")).split()[1])
 
 
 def random_weights(specs):
@@ -197,10 +199,11 @@ def main() -> None:
             else {"forward": forward, "chain": chain}[args.part]()
         )
         return args.child.write_text(json.dumps(found)) and None
-    record = json.loads(RESULT.read_text()) if RESULT.exists() else {}
     for part in (args.part,) if args.part else PARTS:
-        record[part] = child(part)
-        print(part, json.dumps(record[part])[:2000], flush=True)
+        found = child(part)
+        print(part, json.dumps(found)[:2000], flush=True)
+        record = json.loads(RESULT.read_text()) if RESULT.exists() else {}
+        record[part] = found
         import jax  # noqa: F401  the record names its version
 
         from roge_jax.entry import environment
