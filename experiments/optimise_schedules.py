@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from quality.scenes import DEFAULT_M, Sampler, assemble, fingerprint, most_steps, render
 
-from roge_jax import model
 from roge_jax.checkpoint import load_model
 from roge_jax.entry import enable_cache
 from roge_jax.video import flow, solvers
@@ -39,9 +38,9 @@ SOLVERS = ("euler", "ab2", "unipc_2", "dpmpp_2m", "midpoint", "heun")
 class Problem:
     """A batch of scenes with its teacher's result."""
 
-    def __init__(self, params: Any, config: Any, first: int, count: int, prepare: Any):
+    def __init__(self, params: Any, config: Any, first: int, count: int):
         sequences = render(range(first, first + count), config)
-        self.sampler = Sampler(params, assemble(params, sequences, config, prepare=prepare), config)
+        self.sampler = Sampler(params, assemble(params, sequences, config), config)
         self.fine = flow.schedule("graded", TEACHER_STEPS, power=1.5)
         self.teacher = self.sampler.run("midpoint", self.fine).latents
 
@@ -106,10 +105,7 @@ def main(args: argparse.Namespace) -> None:
     enable_cache()
     began = time.perf_counter()
     params, config = load_model(args.checkpoint)
-    prepare = jax.jit(functools.partial(model.prepare, config=config))
-    problem, check = (
-        Problem(params, config, first, args.scenes, prepare) for first in (SEARCH, CHECK)
-    )
+    problem, check = (Problem(params, config, first, args.scenes) for first in (SEARCH, CHECK))
     grids, records = search(problem, check, args.solvers, config.flow.shift)
     found = {
         "command": f"python experiments/optimise_schedules.py --checkpoint {args.checkpoint} "

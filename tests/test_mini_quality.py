@@ -1,14 +1,18 @@
 """The experiment on the trained model: what it measures and how it decides."""
 
+import argparse
+import json
 import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
+import mini_quality
 from mini_quality import verdict
-from quality import charts
+from quality import charts, knobs
 from quality.measures import GAP, consistency, same_surface
 from quality.scenes import CONTEXTS, most_steps, photos
 
@@ -125,3 +129,27 @@ def test_a_budget_is_never_overdrawn():
         for budget in (4, 8, 12):
             steps = most_steps(solver, budget)
             assert nfe(solver, steps) <= budget < nfe(solver, steps + 1)
+
+
+@pytest.mark.slow
+def test_the_experiment_runs_from_weights_to_document(tmp_path, monkeypatch):
+    """A few points of every part, on the shipped model."""
+    document = tmp_path / "solvers.md"
+    document.write_text((Path(__file__).parents[1] / "docs" / "solvers.md").read_text())
+    monkeypatch.setattr(mini_quality, "OUT", tmp_path)
+    monkeypatch.setattr(mini_quality, "DOCUMENT", document)
+    monkeypatch.setattr(mini_quality, "TOLERANCES", (0.3,))
+    monkeypatch.setattr(knobs, "PHOTOS", (3,))
+    monkeypatch.setattr(knobs, "SIZES", ((48, 80),))
+    monkeypatch.setattr(knobs, "PEER_STEPS", (2,))
+    args = {"checkpoint": "mini", "scenes": 2, "solvers": ["euler"], "budgets": [4, 8]}
+    mini_quality.main(argparse.Namespace(**args, reference=8))
+    report = json.loads((tmp_path / "mini_quality.json").read_text())
+    assert {r["evaluations"] for r in report["records"] if r["solver"] == "euler"} == {4, 8}
+    wanted = {"M", "steps", "resolution", "numbers", "cache", "refinement", "ceiling"}
+    assert {r["knob"] for r in report["knobs"]} == wanted
+    error = {(r["schedule"], r["steps"]): r["metrics"]["latent_error"]["mean"] for r in report["records"]}  # fmt: skip
+    assert error["uniform", 8] < error["uniform", 4]
+    assert report["settings"]["weights"] in document.read_text()
+    for name in ("mini_quality.png", "mini_knobs.png"):
+        assert 10_000 < (tmp_path / name).stat().st_size < 300_000

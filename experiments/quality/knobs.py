@@ -14,8 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from quality.measures import Judge, difference, summary
-from quality.scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos
 from roge_jax import config as configs
 from roge_jax import cost, fusion, model
 from roge_jax.config import RoGeConfig
@@ -24,6 +22,9 @@ from roge_jax.data.procedural import sample_sequence
 from roge_jax.metrics import baselines
 from roge_jax.sampling import SCHEDULE, SOLVER, STEPS
 from roge_jax.video import dit
+
+from .measures import Judge, difference, summary
+from .scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos, preparer
 
 Record = dict[str, Any]
 PHOTOS = tuple(range(1, CONTEXTS + 1))
@@ -56,8 +57,8 @@ def over_photos(params, config: RoGeConfig, sequences, known: dict[int, Scenes])
     records = []
     rgb = jax.jit(jax.vmap(functools.partial(model.decode_rgb, config=config), in_axes=(None, 0)))
     for m in PHOTOS:
-        prepare = jax.jit(functools.partial(model.prepare, config=config))
-        scenes = known.get(m) or assemble(params, sequences, config, m, prepare=prepare)
+        prepare = preparer(config)
+        scenes = known.get(m) or assemble(params, sequences, config, m)
         one = {name: value[0] for name, value in scenes.views.items()}
         prepare(params, one).features.block_until_ready()
         began = time.perf_counter()
@@ -177,9 +178,9 @@ def in_bfloat16(params, config: RoGeConfig, scenes: Scenes, exact) -> list[Recor
         for path, leaf in flatten(params).items()
     }
     half = unflatten(flat)
-    prepare = jax.jit(functools.partial(model.prepare, config=config))
     each = [
-        prepare(half, {k: v[i] for k, v in scenes.views.items()}) for i in range(len(scenes.truth))
+        preparer(config)(half, {k: v[i] for k, v in scenes.views.items()})
+        for i in range(len(scenes.truth))
     ]
     batch = scenes._replace(prepared=jax.tree.map(lambda *x: jnp.stack(x), *each))
     more, scores = sampled(half, config, batch)

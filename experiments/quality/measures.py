@@ -6,12 +6,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from quality.scenes import Scenes
 
 from roge_jax import model
 from roge_jax.config import RoGeConfig
 from roge_jax.metrics import image, report
 from roge_jax.metrics.baselines import bilinear
+
+from .scenes import Scenes
 
 IMAGE = ("psnr", "sharpness_ratio", "gradient_psnr")
 GAP = 4  # frames between the two views that are compared with one another
@@ -32,8 +33,7 @@ class Judge:
 
     def __init__(self, params: Any, config: RoGeConfig, scenes: Scenes):
         self.params, self.scenes = params, scenes
-        decode = functools.partial(model.decode_video, config=config)
-        self._decode = jax.jit(jax.vmap(decode, in_axes=(None, 0)))
+        self._decode = _decoder(config)
         self.pairs = [
             same_surface(depth, K[scenes.m :], c2w[scenes.m :])
             for depth, K, c2w in zip(scenes.depth, scenes.K, scenes.c2w)
@@ -62,6 +62,12 @@ class Judge:
             for a, b in zip(frames, reference_frames)
         ]
         return {"latent_error": gap.tolist(), "psnr_reference": close}
+
+
+@functools.cache
+def _decoder(config: RoGeConfig):
+    decode = functools.partial(model.decode_video, config=config)
+    return jax.jit(jax.vmap(decode, in_axes=(None, 0)))
 
 
 def same_surface(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> list[tuple]:

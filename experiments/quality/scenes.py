@@ -60,10 +60,8 @@ def assemble(
     sequences: Sequence[dict[str, np.ndarray]],
     config: RoGeConfig,
     m: int = DEFAULT_M,
-    *,
-    prepare: Any = None,
 ) -> Scenes:
-    """`prepare`: a compiled `model.prepare` to reuse."""
+    """Everything of the rendered `sequences` with m photos each."""
     context, target = photos(config.frames, m)
     order = context + target
     samples = [
@@ -78,8 +76,9 @@ def assemble(
     ]
     views = {name: np.stack([sample[name] for sample in samples]) for name in samples[0]}
     truth = views.pop("target_rgb")
-    prepare = prepare or jax.jit(functools.partial(model.prepare, config=config))
-    each = [prepare(params, {k: v[i] for k, v in views.items()}) for i in range(len(truth))]
+    each = [
+        preparer(config)(params, {k: v[i] for k, v in views.items()}) for i in range(len(truth))
+    ]
     shape = (*config.latent_size, config.vae.latent)
     slots = config.slots(m) - m
     noise = [
@@ -165,6 +164,12 @@ def _field(params, prepared, noise, x, sigma, *, config):
         return field(project(x, sigma), sigma)
 
     return jax.vmap(one)(prepared, noise, x)
+
+
+@functools.cache
+def preparer(config: RoGeConfig):
+    """`model.prepare` of one scene, jitted once a config."""
+    return jax.jit(functools.partial(model.prepare, config=config))
 
 
 @functools.cache
