@@ -225,18 +225,18 @@ def lora(
 ) -> dict:
     """The paper's stage at a high rank for `steps` of one scene, then the update cut to lower ranks."""
     stage = stages.lora_stage(1, frames=config.frames)
-    optim = dataclasses.replace(stage.optim, learning_rate=1e-3, warmup=10)
     views = dataclasses.replace(stage.views, contexts=(CONTEXTS,), context_weights=(1.0,))
-    stage = dataclasses.replace(stage, optim=optim, views=views, draws=4, remat="dots")
+    stage = dataclasses.replace(stage, views=views, draws=4, remat="dots")
     config = dataclasses.replace(config, lora=dataclasses.replace(config.lora, dit_rank=rank, recon_rank=rank))  # fmt: skip
     trainable, frozen = model.split(params, stage.trains)
     added = model.adapter_specs(config)
     specs = attach(model.split(model.specs(config), stage.trains)[0], added)
     trainable = attach(trainable, init_specs(jax.random.key(1), added))
-    optimiser = make_optimiser(optim, specs, 10**6)
+    optimiser = make_optimiser(stage.optim, specs, steps)
     objective = functools.partial(stages.joint_objective, config=config, stage=stage)
-    step = jax.jit(loop.make_step(objective, optimiser, optim), donate_argnums=0)
-    state, clock = loop.initial_state(jax.tree.map(jnp.copy, trainable), optimiser, optim), Clock()
+    step = jax.jit(loop.make_step(objective, optimiser, stage.optim), donate_argnums=0)
+    copied = jax.tree.map(jnp.copy, trainable)  # the step donates its state
+    state, clock = loop.initial_state(copied, optimiser, stage.optim), Clock()
     for i in range(steps):
         batch = stages.stage_batch(source, stage, config, 0, i)
         state, _ = clock.run(step, state, frozen, batch, jax.random.key(i))
@@ -275,6 +275,7 @@ def lora(
     return {
         "group": "lora",
         "rank": rank,
+        "learning_rate": stage.optim.learning_rate,
         "trained": count(specs),
         "spectrum": spectrum(unflatten(factors)),
         "losses": losses,

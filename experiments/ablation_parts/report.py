@@ -141,7 +141,7 @@ def draw(rows: dict[str, dict], path: Path) -> None:
 
     fig = plt.figure(figsize=(16.5, 9.5))
     outer = fig.add_gridspec(
-        1, 2, width_ratios=[1, 1.45], left=0.165, right=0.985, top=0.95, bottom=0.065, wspace=0.17
+        1, 2, width_ratios=[1, 1.45], left=0.165, right=0.985, top=0.95, bottom=0.075, wspace=0.17
     )
     _variants(fig.add_subplot(outer[0]), rows)
     right = outer[1].subgridspec(2, 2, hspace=0.27, wspace=0.3)
@@ -236,18 +236,18 @@ def _spectrum(ax, row: dict) -> None:
 
 
 def _ranks(ax, row: dict) -> None:
-    ranks = [int(n) for n in row["losses"] if n != "before"]
     last = {k: np.asarray(v) for k, v in row["losses"][str(row["rank"])].items()}
     for k, (term, label) in enumerate((("flow", "flow error"), ("photometric", "RGB head, MSE"))):
         gaps = []
-        for rank in ranks:
-            d = np.asarray(row["losses"][str(rank)][term]) / last[term]
+        for loss in row["losses"].values():
+            d = np.asarray(loss[term]) / last[term]
             gaps.append(bootstrap(100 * (d - 1)))
         mean, low, high = (np.array([g[key] for g in gaps]) for key in ("mean", "low", "high"))
-        ax.errorbar(range(len(ranks)), mean, [mean - low, high - mean], fmt=f"C{k}o-", ms=4,
+        ax.errorbar(range(len(gaps)), mean, [mean - low, high - mean], fmt=f"C{k}o-", ms=4,
                     capsize=3, label=label)  # fmt: skip
     ax.axhline(0, color="k", lw=0.8)
-    ax.set_xticks(range(len(ranks)), [str(r) for r in ranks])
+    names = ["un-\ntrained" if n == "before" else n for n in row["losses"]]
+    ax.set_xticks(range(len(names)), names)
     ax.set(xlabel="rank kept", ylabel="held-out loss above the full update (%)")
     ax.set_title("the update cut to lower rank", fontsize=10)
     ax.grid(True, alpha=0.3)
