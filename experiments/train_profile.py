@@ -1,0 +1,161 @@
+"""Where the time of a training step goes: `make train`'s step (stage `lora` of the shipped model), taken apart.
+
+    python experiments/train_profile.py                    # writes experiments/results/train_profile.json
+    taskset -c 0-3 python experiments/train_profile.py --photos 3 --repeats 9
+
+About 8 minutes on 4 cores, most of it compiling. One scene of `--photos` photos and 17 frames, drawn as the program draws it.
+Compiled on their own and timed in turn: the step; loss and gradient; the loss alone; and the loss's parts, each on the
+arrays that it gets there. Backward is gradient minus loss, optimiser is step minus gradient. Times are CPU seconds of the process
+(medians with lowest and highest), which other programs disturb least; wall seconds stand beside them, and
+steps per second are those of the step alone, without drawing and rendering the batch (`batch` in the results). Compiled apart, a
+part cannot share work with its neighbours, so the parts need not add up to the loss: the difference is `unattributed`.
+"""
+
+import argparse
+import dataclasses
+import functools
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+RESULTS = Path(__file__).parent / "results" / "train_profile.json"
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    return {"median": float(np.median(values)), "low": min(values), "high": max(values)}
+
+
+def timed(function) -> tuple[float, float]:
+    """(CPU seconds, wall seconds) of one call."""
+    import jax
+
+    cpu, wall = time.process_time(), time.perf_counter()
+    jax.block_until_ready(function())
+    return time.process_time() - cpu, time.perf_counter() - wall
+
+
+def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
+    import jax
+
+    from roge_jax import model
+    from roge_jax.checkpoint import load_model
+    from roge_jax.core.lora import attach
+    from roge_jax.core.params import count, init
+    from roge_jax.entry import environment
+    from roge_jax.train import ProceduralSource
+    from roge_jax.training import loop, stages
+    from roge_jax.training.optim import make_optimiser
+
+    params, config = load_model(checkpoint)
+    stage = stages.lora_stage(200, frames=config.frames)
+    working = stages.stage_config(config, stage)
+    source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
+    draw = functools.partial(stages.stage_batch, source, stage, working, seed)
+    batch = next(b for i in range(1000) if (b := draw(i))["context_rgb"].shape[1] == photos)
+    batch_seconds = [timed(lambda i=i: draw(i)) for i in range(1, 4)]
+
+    specs, _ = stages.stage_specs(config, stage)
+    trainable, frozen = model.split(params, stage.trains)
+    trainable = attach(trainable, init(jax.random.key(seed + 1), stages.new_leaves(config, stage)))
+    optimiser = make_optimiser(stage.optim, specs, stage.steps)
+    objective = functools.partial(stages.joint_objective, config=working, stage=stage)
+    key = jax.random.key(seed)
+    views = jax.tree.map(lambda x: jax.numpy.asarray(x[0]), batch)
+
+    def encode(p, views):  # joined outside: a concatenation may be fused with its producers
+        contexts = model.encode_contexts(p, views["context_rgb"], config=working)
+        return contexts, model.encode_targets(p, views["target_rgb"], config=working)
+
+    def transformer(p, x0, features, views):
+        cond = model.condition(p, x0[:photos], features, views, config=working)
+        options = {"config": working, "contexts": photos, "remat": stage.remat}
+        return model.mean_flow_matching(p, x0, cond, key, draws=stage.draws, **options)
+
+    compile_seconds, compiled = {}, {}
+
+    def compile_(name, function, *arguments, **options):
+        start = time.perf_counter()
+        compiled[name] = jax.jit(function, **options).lower(*arguments).compile()
+        compile_seconds[name] = time.perf_counter() - start
+        return compiled[name](*arguments)
+
+    whole = jax.jit(attach)(frozen, trainable)
+    reconstruct = functools.partial(model.reconstruct, config=working)
+    query = functools.partial(model.query_rays, config=working)
+    picture = functools.partial(model.photometric, config=working)
+    arguments = {"VAE encode": (whole, views), "reconstruction": (whole, views)}
+    x0 = jax.numpy.concatenate(compile_("VAE encode", encode, *arguments["VAE encode"]))
+    tokens = compile_("reconstruction", reconstruct, *arguments["reconstruction"])
+    arguments["ray queries"] = (whole, tokens, views)
+    features = compile_("ray queries", query, *arguments["ray queries"])
+    arguments["picture"] = (whole, features, views)
+    compile_("picture", picture, *arguments["picture"])
+    arguments["transformer"] = (whole, x0, features, views)
+    compile_("transformer", transformer, *arguments["transformer"])
+    parts = list(arguments)
+    arguments["loss"] = arguments["gradient"] = (trainable, frozen, batch, key)
+    compile_("loss", objective, *arguments["loss"])
+    compile_("gradient", jax.value_and_grad(objective, has_aux=True), *arguments["gradient"])
+    # Not donated, so that the same state can be given again: one copy of what trains more than in the program.
+    state = loop.initial_state(trainable, optimiser, stage.optim)
+    step = loop.make_step(objective, optimiser, stage.optim)
+    arguments["step"] = (state, frozen, batch, key)
+    compile_("step", step, *arguments["step"])
+
+    seconds = {name: [] for name in arguments}
+    for i in range(repeats):
+        for name in arguments if i % 2 == 0 else reversed(arguments):
+            seconds[name].append(timed(lambda name=name: compiled[name](*arguments[name])))
+    cpu = {name: summary([c for c, _ in values]) for name, values in seconds.items()}
+    wall = {name: summary([w for _, w in values]) for name, values in seconds.items()}
+    middle = {name: value["median"] for name, value in cpu.items()}
+    shares = {name: middle[name] for name in parts}
+    shares["unattributed"] = middle["loss"] - sum(shares.values())
+    shares["backward"] = middle["gradient"] - middle["loss"]
+    shares["optimiser"] = middle["step"] - middle["gradient"]
+    return {
+        "command": f"python experiments/train_profile.py --checkpoint {checkpoint} --photos {photos} "
+        f"--repeats {repeats} --seed {seed}",
+        "environment": environment(),
+        "cores": len(os.sched_getaffinity(0)),
+        "load_average": os.getloadavg(),
+        "size": [working.height, working.width, working.frames],
+        "stage": dataclasses.asdict(stage) | {"optim": dataclasses.asdict(stage.optim)},
+        "trainable": count(trainable),
+        "repeats": repeats,
+        "cpu_s": cpu,
+        "wall_s": wall,
+        "share_of_step": {name: value / middle["step"] for name, value in shares.items()},
+        "steps_per_s": 1 / wall["step"]["median"],
+        "compile_s": compile_seconds,
+        "batch_wall_s": summary([w for _, w in batch_seconds]),
+    }
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--checkpoint", default="mini", help="model folder or name")
+    p.add_argument("--photos", type=int, default=3)
+    p.add_argument("--repeats", type=int, default=9)
+    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--out", type=Path, default=RESULTS)
+    args = p.parse_args()
+    from roge_jax.entry import write_json
+
+    found = profile(args.checkpoint, args.photos, args.repeats, args.seed)
+    write_json(args.out, found)
+    print(f"{'part':16s} {'share':>6s}")
+    for name, share in found["share_of_step"].items():
+        print(f"{name:16s} {share:6.1%}")
+    print(
+        f"step {found['cpu_s']['step']['median']:.2f} CPU s, {found['steps_per_s']:.2f} steps/s, compiled in "
+        f"{found['compile_s']['step']:.0f} s; wrote {args.out}"
+    )
+
+
+if __name__ == "__main__":
+    main()
