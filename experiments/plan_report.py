@@ -121,6 +121,7 @@ def draw(document: dict, file) -> None:
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    import matplotlib.ticker
 
     rows, summary = document["rows"], document["summary"]
     rungs = [r for r in RUNGS if any(row["rung"] == r for row in rows)]
@@ -183,6 +184,7 @@ def draw(document: dict, file) -> None:
     ax.plot([low, high], [2 * low, 2 * high], "k:", lw=0.8, label="factor 2")
     ax.plot([low, high], [low / 2, high / 2], "k:", lw=0.8)
     ax.set(xscale="log", yscale="log", xlabel="predicted RMS error", ylabel="realised RMS error")
+    ax.xaxis.set_minor_formatter(matplotlib.ticker.NullFormatter())
     ax.set_title(f"Prediction: Spearman {summary['spearman']:.2f} over {summary['points']} plans")
     ax.grid(alpha=0.3)
     ax.legend(fontsize=8)
