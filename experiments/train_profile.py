@@ -79,7 +79,7 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
         start = time.perf_counter()
         compiled[name] = jax.jit(function, **options).lower(*arguments).compile()
         compile_seconds[name] = time.perf_counter() - start
-        return compiled[name](*arguments)
+        return jax.block_until_ready(compiled[name](*arguments))
 
     whole = jax.jit(attach)(frozen, trainable)
     reconstruct = functools.partial(model.reconstruct, config=working)
