@@ -130,7 +130,9 @@ def plan(
     # Traced with this device's share of the scenes, but all of their tokens.
     whole = None if mesh is None else sharding.abstract_mesh()
     part_of = dataclasses.replace(stage, batch=scenes)
-    traced, arguments = _traced(config, part_of, m, scenes, jnp.dtype(dtype), fused_attention, whole)
+    traced, arguments = _traced(
+        config, part_of, m, scenes, jnp.dtype(dtype), fused_attention, whole
+    )
 
     tokens = sequence_lengths(working, m)
     split = split_axes(working, tokens, scenes)
