@@ -1,16 +1,19 @@
 """The training program on the tiny preset: a few real steps, resume, what it writes, what it refuses."""
 
+import dataclasses
 import json
 import shutil
 
 import jax
 import numpy as np
 import pytest
+from test_sharding import small
 
-from roge_jax import train
+from roge_jax import config, train
 from roge_jax.checkpoint import load_model
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
+from roge_jax.training import stages
 
 
 def run(*arguments) -> None:
@@ -23,7 +26,18 @@ def losses(folder) -> list[float]:
 
 @pytest.fixture(scope="module")
 def common():
-    return ["tiny", "--devices", 1, "--log-every", 1, "--save-every", 1]
+    """Options of a short run, made quick to compile: `tiny` with a smaller VAE, two contexts in every batch."""
+    smaller, lora_stage = small(), stages.lora_stage
+
+    def two_contexts(*arguments, **options):
+        stage = lora_stage(*arguments, **options)
+        views = dataclasses.replace(stage.views, contexts=(2,), context_weights=(1.0,))
+        return dataclasses.replace(stage, views=views)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(config.PRESETS, "tiny", lambda: smaller)
+        patch.setattr(stages, "lora_stage", two_contexts)
+        yield ["tiny", "--devices", 1, "--log-every", 1, "--save-every", 1]
 
 
 def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
