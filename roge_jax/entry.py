@@ -257,7 +257,9 @@ def peak_memory() -> dict[str, float]:
     """Peak memory in GB (1e9 bytes): of this process, and of the first device where JAX reports it."""
     found = {}
     status = Path("/proc/self/status")
-    if status.exists():  # Linux; its ru_maxrss starts from that of the program that started this one
+    if (
+        status.exists()
+    ):  # Linux; its ru_maxrss starts from that of the program that started this one
         line = next(x for x in status.read_text().splitlines() if x.startswith("VmHWM"))
         found["peak_memory_gb"] = int(line.split()[1]) * 1024 / 1e9
     else:

@@ -409,7 +409,9 @@ def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
         == 0
     )
     shown = capsys.readouterr().out
-    assert said in shown and f"velocity, each of {sampling.STEPS}" in shown and "peak memory" in shown
+    assert (
+        said in shown and f"velocity, each of {sampling.STEPS}" in shown and "peak memory" in shown
+    )
     assert not any(tmp_path.iterdir())
 
 
