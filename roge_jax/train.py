@@ -31,8 +31,8 @@ def parser() -> argparse.ArgumentParser:
         default="lora",
         help="lora (default): LoRA on both halves + new embeddings, the paper's joint training;\n"
         "hires: the same with the reconstruction frozen, at --size;\n"
-        "vae_images, vae_clips, recon_low, recon, prior, generator, joint: one stage of the recipe\n"
-        "that makes a small model from nothing; all: all of them in order",
+        "vae_images, vae_clips, vae_longer, recon_low, recon, prior, generator, vae_decoder, joint: one stage\n"
+        "of the recipe that makes a small model from nothing; all: all of them in order",
     )
     p.add_argument(
         "--init",
@@ -121,7 +121,12 @@ class ProceduralSource:
         from .data.procedural import sample_sequence
 
         return sample_sequence(
-            index, height=self.height, width=self.width, frames=self.frames, depth=False
+            index,
+            height=self.height,
+            width=self.width,
+            frames=self.frames,
+            depth=False,
+            varied=True,
         )
 
 
@@ -307,7 +312,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
     if stage.lora:
         added = stages.new_leaves(cfg, stage)
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
-    frozen = frozen if frozen_specs else {}
+    frozen = stages.read(frozen, stage)
     dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
     if dtype != "float32":
         frozen = reduced(frozen, dtype)
@@ -366,7 +371,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
     with on_host():
         params = merge(attach(params, unflatten(full)), unflatten(lora))
-    if stage.objective == "vae":
+    if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
     provenance = {
         "stage": stage.name,

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from roge_jax.data import pool as pool_module
 from roge_jax.data import procedural, raycast
 from roge_jax.data.pool import _missing, read_pool, write_pool
 from roge_jax.data.procedural import (
@@ -144,6 +145,40 @@ def test_depth_and_pose_lead_to_the_same_surface(seed):
     # What neighbouring views do not share lies along silhouettes. 12 of them, each as long as a
     # fifth of the 24 rows and covered for about a pixel, are below a tenth of the picture.
     assert (np.abs(error) < 1e-3).mean() > 0.9
+
+
+def test_varied_lenses_are_those_of_the_pictures():
+    """Many lenses and orbits, and the depth of each view is exact through its own K."""
+    cameras = jax.jit(procedural.varied_cameras, static_argnums=(1, 2, 3))
+    found = [cameras(np.int32(seed), 5, 24, 40) for seed in range(60)]
+    orbit = np.array([orbit for orbit, _ in found])
+    K = np.stack([K for _, K in found]).astype(np.float64)
+    fov = 2 * np.rad2deg(np.arctan(20 / K[:, :, 0, 0]))
+    low, high = procedural.VARIED_FOV
+    assert low - 1e-3 <= fov.min() < 30 and 80 < fov.max() <= high + 1e-3
+    assert procedural.VARIED_SWEEP[0] <= orbit.min() < 20 and 130 < orbit.max() <= 170 + 1e-3
+    constant = np.ptp(fov, axis=1) < 1e-3
+    smooth = (np.abs(np.diff(np.log(fov), 2, axis=1)) < 1e-3).all(1) & ~constant
+    assert 10 <= constant.sum() <= 32 and 8 <= smooth.sum() <= 32
+    off = np.abs(K[:, 0, :2, 2] / [40, 24] - 0.5)
+    assert 18 <= (off > 1e-4).all(1).sum() <= 42 and off.max() <= 0.1 + 1e-6
+
+    seed = int(np.flatnonzero(~constant & ~smooth & (off > 0.03).any(1))[0])
+    views = sample_sequence(seed, **SMALL, varied=True)
+    np.testing.assert_allclose(views["K"], K[seed], rtol=1e-6)
+    scene = _scenes(np.int32(seed), _plain_textures())
+    sweep = (orbit[seed], orbit[seed])
+    dense = camera_path(seed, procedural._PATH_SAMPLES, scene=scene, sweep=sweep)
+    scene = clear_views(scene, dense["c2w"])
+    room, half = (np.asarray(x)[None, raycast.ROOM] for x in (scene.centre, scene.half))
+    y, x = (grid.ravel() + 0.5 for grid in np.mgrid[:24, :40])
+    for i in (0, 4):
+        local = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K[seed, i]).T
+        c2w, depth = views["c2w"][i], views["depth"][i].ravel()
+        end = (local * depth[:, None]) @ c2w[:3, :3].T + c2w[:3, 3]
+        wall = np.abs(np.abs(end - room) - half).min(-1)
+        on_object = np.abs(_inside(scene, end) - 1).min(-1) < 1e-3
+        assert (on_object | (wall < 1e-3) | (depth == SKY_DEPTH)).mean() > 0.99
 
 
 def test_principal_ray_and_pixel_centres():
@@ -363,3 +398,13 @@ def test_command_line_reports_mistakes_in_one_sentence(tmp_path):
     done = subprocess.run([*command, "--first-seed", "-3"], capture_output=True, text=True)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "seed -3" in done.stderr and len(done.stderr.strip().splitlines()) == 1
+
+
+def test_training_pools_are_varied_and_held_out_ones_are_not(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr(pool_module, "write_pool", lambda *a, **options: asked.append(options))
+    command = ["pool", "--out", str(tmp_path), "--scenes", "1", "--first-seed"]
+    pool_module.main([*command, "0"])
+    pool_module.main([*command, "0", "--no-varied"])
+    pool_module.main([*command, str(HELDOUT_SEED)])
+    assert [options["varied"] for options in asked] == [True, False, False]

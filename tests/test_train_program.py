@@ -1,6 +1,7 @@
 """The training program on the tiny preset: a few real steps, resume, what it writes, what it refuses."""
 
 import dataclasses
+import functools
 import json
 import shutil
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from test_sharding import small
 
-from roge_jax import config, train
+from roge_jax import config, model, train
 from roge_jax.checkpoint import load_model
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
@@ -63,3 +64,23 @@ def test_unknown_stage_and_batch_that_does_not_divide_are_refused(tmp_path):
         run("tiny", "--stage", "recom", "--out", tmp_path)
     with pytest.raises(UserError, match="mini"):
         run("minni", "--out", tmp_path)
+
+
+def test_a_stage_gets_what_its_objective_reads():
+    """Trained and frozen leaves together are the modules that the objective needs, and `vae_decoder` keeps latents."""
+    cfg = config.preset("tiny")
+    needs = {"vae": {"vae"}, "recon": {"encoder", "renderer"}}
+    for stage in stages.mini_stages(frames=cfg.frames):
+        trained, frozen = (flatten(tree) for tree in stages.stage_specs(cfg, stage))
+        assert not set(trained) & set(frozen)
+        modules = {path.split("/")[0] for path in [*trained, *frozen]}
+        assert modules == needs.get(stage.objective, set(model.specs(cfg)))
+        assert stages.moves_latents(trained) == (
+            stage.objective == "vae" and stage.name != "vae_decoder"
+        )
+    decoder = stages.find_stage(stages.mini_stages(frames=cfg.frames), "vae_decoder")
+    params = model.init(jax.random.key(0), cfg)
+    trained, frozen = model.split(params, decoder.trains)
+    batch = {"target_rgb": jax.ShapeDtypeStruct((1, 5, 16, 16, 3), np.float32)}
+    objective = functools.partial(stages.vae_objective, config=cfg, stage=decoder)
+    jax.eval_shape(objective, trained, stages.read(frozen, decoder), batch, jax.random.key(0))

@@ -64,6 +64,7 @@ def write_pool(
     supersample: int = 2,
     scenes_per_shard: int = 100,
     depth: bool = False,
+    varied: bool = False,
 ) -> None:
     """Render `sample_sequence` of every seed into a pool with one-thread worker processes.
 
@@ -85,7 +86,7 @@ def write_pool(
             f"write seeds from {HELDOUT_SEED} on into a pool of their own."
         )
     settings = {"frames": frames, "height": height, "width": width, "supersample": supersample}
-    settings |= {"scenes_per_shard": scenes_per_shard, "depth": depth}
+    settings |= {"scenes_per_shard": scenes_per_shard, "depth": depth, "varied": varied}
     settings |= {"first_seed": int(wanted[0])}
     path.mkdir(parents=True, exist_ok=True)
     with _sole_writer(path):
@@ -189,6 +190,7 @@ def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
             width=w,
             supersample=settings["supersample"],
             depth=depth,
+            varied=settings["varied"],
         )
         for name, store in maps.items():
             store[row] = views[name]
@@ -232,7 +234,9 @@ def read_pool(path: str | Path) -> Pool:
     )
 
 
-def _sheet(out: Path, seeds: Sequence[int], *, views: int, height: int, width: int) -> None:
+def _sheet(
+    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, varied: bool = False
+) -> None:
     """A contact sheet: one row of views per scene."""
     from PIL import Image
 
@@ -240,7 +244,9 @@ def _sheet(out: Path, seeds: Sequence[int], *, views: int, height: int, width: i
 
     rows = []
     for seed in seeds:
-        scene = sample_sequence(seed, frames=views, height=height, width=width, supersample=3)
+        scene = sample_sequence(
+            seed, frames=views, height=height, width=width, supersample=3, varied=varied
+        )
         rows.append(np.concatenate(list(scene["rgb"]), 1))
     half = (len(rows) + 1) // 2  # two scenes beside each other
     rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
@@ -287,10 +293,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     pool.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     pool.add_argument("--scenes-per-shard", type=int, default=100)
     pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
+    pool.add_argument(
+        "--varied",
+        action=argparse.BooleanOptionalAction,
+        help="many orbits and lenses (default: for training seeds, not for held-out ones)",
+    )
     sheet = commands.add_parser("sheet", help="draw a contact sheet")
     sheet.add_argument("--out", type=Path, required=True)
     sheet.add_argument("--scenes", type=int, default=8)
     sheet.add_argument("--first-seed", type=int, default=0)
+    sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
     bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
     for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
         command.add_argument("--frames", type=int, default=frames)
@@ -307,7 +319,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(args: argparse.Namespace) -> None:
+    from roge_jax.data.procedural import HELDOUT_SEED
+
     if args.command == "pool":
+        training = args.first_seed < HELDOUT_SEED
         write_pool(
             args.out,
             range(args.first_seed, args.first_seed + args.scenes),
@@ -318,9 +333,11 @@ def _run(args: argparse.Namespace) -> None:
             supersample=args.supersample,
             scenes_per_shard=args.scenes_per_shard,
             depth=args.depth,
+            varied=training if args.varied is None else args.varied,
         )
     elif args.command == "sheet":
         seeds = range(args.first_seed, args.first_seed + args.scenes)
-        _sheet(args.out, seeds, views=args.frames, height=args.height, width=args.width)
+        size = {"height": args.height, "width": args.width, "varied": args.varied}
+        _sheet(args.out, seeds, views=args.frames, **size)
     else:
         print(json.dumps(_bench(args.height, args.width, args.frames, args.supersample)))

@@ -46,12 +46,15 @@ __all__ = [
     "render_views",
     "sample_sequence",
     "split_of",
+    "varied_cameras",
     "write_pool",
 ]
 
 HELDOUT_SEED = 1_000_000_000
 CLEARANCE = 0.35  # free space around every camera centre
 SWEEP = (20.0, 60.0)  # degrees of orbit over a whole path
+VARIED_SWEEP = (12.0, 170.0)  # the same for training, log-uniform
+VARIED_FOV = (26.0, 86.0)  # degrees, log-uniform
 _PATH_SAMPLES = 64  # where a path is checked for objects in the way
 
 
@@ -228,22 +231,45 @@ def intrinsics(fov: Array | float, height: int, width: int) -> Array:
     return jnp.stack(rows).reshape(3, 3)
 
 
+def varied_cameras(seed: Array, n: int, height: int, width: int) -> tuple[Array, Array]:
+    """Orbit in degrees `[]` and K `[n,3,3]` of a training sequence: what a camera may do beyond one fixed lens.
+
+    The lens is constant, zooms smoothly along the path, or differs from view to view, a third each; the principal
+    point lies off the centre, by up to a tenth of the image, in half of the sequences.
+    """
+    dice = Dice(jax.random.fold_in(jax.random.key(seed), 11), n + 16)
+    orbit = jnp.exp(dice((), *np.log(VARIED_SWEEP)))
+    kind = dice.pick((), (1 / 3, 1 / 3, 1 / 3))
+    zoom = dice((), -0.6, 0.6) * jnp.linspace(-1.0, 1.0, n)
+    jitter = dice((n,), -0.35, 0.35)
+    log_fov = dice((), *np.log(VARIED_FOV)) + jnp.stack([jnp.zeros(n), zoom, jitter])[kind]
+    K = jax.vmap(lambda fov: intrinsics(fov, height, width))(jnp.exp(log_fov).clip(*VARIED_FOV))
+    shift = dice((2,), -0.1, 0.1) * (dice() < 0.5) * jnp.array([width, height])
+    return orbit, K.at[:, :2, 2].add(shift[None])
+
+
 @functools.partial(
-    jax.jit, static_argnames=("frames", "height", "width", "supersample", "sweep", "depth")
+    jax.jit,
+    static_argnames=("frames", "height", "width", "supersample", "sweep", "depth", "varied"),
 )
-def _sequence(seed, textures, *, frames, height, width, supersample, sweep, depth):
+def _sequence(seed, textures, *, frames, height, width, supersample, sweep, depth, varied):
+    if varied:
+        orbit, K = varied_cameras(seed, frames, height, width)
+        sweep = (orbit, orbit)
     scene = make_scene(seed, textures=textures)
     dense = camera_path(seed, _PATH_SAMPLES, scene=scene, sweep=sweep)
     scene = clear_views(scene, dense["c2w"])
     path = camera_path(seed, frames, scene=scene, sweep=sweep)
-    K = intrinsics(path["fov"], height, width)
+    if not varied:
+        K = jnp.repeat(intrinsics(path["fov"], height, width)[None], frames, 0)
 
-    def one(c2w):
-        view = render(scene, K, c2w, height=height, width=width, supersample=supersample)
-        rgb = jnp.round(view["rgb"] * 255).astype(jnp.uint8)
-        return (rgb, view["depth"]) if depth else (rgb, jnp.zeros(()))
+    def one(view):
+        K, c2w = view
+        drawn = render(scene, K, c2w, height=height, width=width, supersample=supersample)
+        rgb = jnp.round(drawn["rgb"] * 255).astype(jnp.uint8)
+        return (rgb, drawn["depth"]) if depth else (rgb, jnp.zeros(()))
 
-    return *jax.lax.map(one, path["c2w"]), K, path["c2w"]
+    return *jax.lax.map(one, (K, path["c2w"])), K, path["c2w"]
 
 
 def sample_sequence(
@@ -255,8 +281,14 @@ def sample_sequence(
     supersample: int = 2,
     sweep: tuple[float, float] = SWEEP,
     depth: bool = True,
+    varied: bool = False,
 ) -> dict[str, np.ndarray]:
     """The views of one scene along one smooth path.
+
+    Args:
+        sweep: degrees of orbit over the path, drawn uniformly.
+        varied: the training distribution: orbits and lenses of `varied_cameras` in place of `sweep` and one
+            centred lens of 45 to 75 degrees.
 
     Returns:
         `rgb` uint8 `[f,h,w,3]`, `depth` float32 `[f,h,w]` (z-depth; sky `SKY_DEPTH`; absent with
@@ -275,10 +307,11 @@ def sample_sequence(
         supersample=supersample,
         sweep=tuple(map(float, sweep)),
         depth=depth,
+        varied=varied,
     )
     out = {
         "rgb": np.asarray(rgb),
-        "K": np.repeat(np.asarray(K, np.float64)[None], frames, 0),
+        "K": np.asarray(K, np.float64),
         "c2w": np.asarray(c2w, np.float64),
     }
     return out | {"depth": np.asarray(z)} if depth else out

@@ -90,6 +90,8 @@ def joint_objective(trainable, frozen, batch, key, *, config, stage):
     )
 
 
+READS = {"vae": "^vae/", "recon": "^(encoder|renderer)/"}  # other objectives read the whole model
+
 OBJECTIVES = {
     "vae": vae_objective,
     "recon": recon_objective,
@@ -114,13 +116,15 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
         # Whole windows: after short clips alone, frames from the sixth on lose up to 6 dB.
-        Stage("vae_longer", "vae", "^vae/", 800, 1, _GENTLE, video, crop=64),
+        Stage("vae_longer", "vae", "^vae/", 1500, 1, _GENTLE, video, crop=64),
         Stage(
             "recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2
         ),
         Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
         Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=12),
+        # The latents stay as the generator knows them: only their decoding still improves.
+        Stage("vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=64),
         Stage(
             "joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4
         ),
@@ -189,7 +193,17 @@ def stage_specs(config: RoGeConfig, stage: Stage) -> tuple[Tree, Tree]:
     trained, frozen = model.split(model.specs(config), stage.trains)
     if stage.lora:
         trained = attach(trained, new_leaves(config, stage))
-    return trained, {} if stage.objective in ("vae", "recon") else frozen
+    return trained, read(frozen, stage)
+
+
+def read(frozen: Tree, stage: Stage) -> Tree:
+    """Those of the frozen leaves that the stage's objective reads."""
+    return model.split(frozen, READS.get(stage.objective, ""))[0]
+
+
+def moves_latents(trained) -> bool:
+    """Whether any of these parameter paths changes the latents of a video."""
+    return any(path.startswith(("vae/encoder/", "vae/quant/")) for path in trained)
 
 
 def measure_latents(
