@@ -3,7 +3,7 @@
     import roge_jax as rj
     params, config = rj.load("mini")
 
-Submodules are imported on first use, so that `import roge_jax` costs nothing.
+docs/library.md shows the rest. Modules are imported on first use, so that `import roge_jax` costs nothing.
 """
 
 import importlib
@@ -19,6 +19,8 @@ _PUBLIC = {
     "Scene": ("data.scene", "Scene"),
     "load_scene": ("data.scene", "load_scene"),
     "make_path": ("geometry.trajectories", "make_path"),
+    "load_path": ("geometry.paths", "load_path"),
+    "save_path": ("geometry.paths", "save_path"),
     "plan": ("planning.plan", "plan"),
     "UserError": ("errors", "UserError"),
 }
@@ -26,12 +28,18 @@ _MODULES = (
     "model",
     "config",
     "checkpoint",
+    "sampling",
     "fusion",
+    "cost",
+    "core",
     "geometry",
     "recon",
     "video",
     "data",
     "metrics",
+    "planning",
+    "training",
+    "weights",
 )
 
 __all__ = ["__version__", *_MODULES, *_PUBLIC]
