@@ -9,10 +9,16 @@ BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
 CODE := roge_jax tests experiments
+# Experiments that draw something; stored sampling grids come first, because the charts use them. Left out: parts of other
+# experiments, and comparisons with PyTorch (`make compare`).
+PARTS := experiments/plan_report.py experiments/plan_runs.py experiments/robustness_report.py
+COMPARISONS := experiments/dit_speed.py experiments/vae_speed.py experiments/real_size.py
+FIGURES := experiments/optimise_schedules.py \
+	$(filter-out experiments/optimise_schedules.py $(PARTS) $(COMPARISONS),$(wildcard experiments/*.py))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help
-.PHONY: help sample train evaluate smoke test test-slow test-parity check lint format figures notebook clean
+.PHONY: help sample train evaluate smoke test test-slow test-parity check lint format figures compare notebook clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,7 +27,7 @@ sample: $(BASE)  ## two real photos in, the video along a path out (outputs/samp
 	$(RUN) -m roge_jax.sample --out outputs/sample $(ARGS)
 
 train: $(BASE)  ## train the shipped model further, end to end, into a new folder under runs/
-	$(RUN) -m roge_jax.train mini --out runs/$(shell date +%Y%m%d-%H%M%S) $(ARGS)
+	$(RUN) -m roge_jax.train mini --evaluate-every 50 --out runs/$(shell date +%Y%m%d-%H%M%S) $(ARGS)
 
 evaluate: $(BASE)  ## the shipped model beside its baselines on held-out scenes
 	$(RUN) -m roge_jax.evaluate --scenes procedural:1000000000..1000000009 --out outputs/results.json $(ARGS)
@@ -50,8 +56,11 @@ format: $(DEV)  ## let ruff order imports and lay out the code
 	$(VENV)/bin/ruff check --fix $(CODE)
 	$(VENV)/bin/ruff format $(CODE)
 
-figures: $(DEV)  ## every experiment again; writes experiments/results (long)
-	@for f in experiments/*.py; do echo "== $$f"; $(RUN) $$f || exit 1; done
+figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/figures.md has single ones)
+	@for f in $(FIGURES); do echo "== $$f"; $(RUN) $$f || exit 1; done
+
+compare: $(PARITY)  ## speed beside PyTorch (installs torch and diffusers); writes experiments/results
+	@for f in $(COMPARISONS); do echo "== $$f"; $(RUN) $$f || exit 1; done
 
 notebook: $(DEV)  ## run the notebook; the executed copy is outputs/from_rays_to_video.ipynb
 	@mkdir -p outputs

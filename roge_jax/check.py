@@ -211,7 +211,8 @@ def _about_agreement(
         return numbers, []
     what = f"matched features lie {distances[now]:.1f} pixels from where the poses put them"
     if distances[best] < min(BAD_FIT, distances[now] / 3):
-        fix = f"read as '{best}' it is {distances[best]:.2f}: pass convention='{best}'"
+        fix = f"read as '{best}' it is {distances[best]:.2f}: give --convention {best}"
+        fix += f" (in Python convention='{best}')"
         return numbers, [Finding("error", "poses", what, fix)]
     fix = "check intrinsics, picture order and poses (moving things also do this)"
     return numbers, [Finding("warning", "poses", what, fix)]

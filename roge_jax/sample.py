@@ -28,6 +28,7 @@ LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
 
 
 def parser() -> argparse.ArgumentParser:
+    from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
     from .sampling import LONG, SCHEDULE, SLOTS, SOLVER, STEPS
     from .video.flow import SCHEDULES
@@ -62,6 +63,10 @@ def parser() -> argparse.ArgumentParser:
         f"photo 4 alone), the first being the world frame; up to {DEFAULT_CONTEXT} if not given"
     )
     option("--context", ids_help, metavar="M|IDS")
+    axes_help = (
+        f"axes of the poses of a transforms.json that are not OpenGL: {', '.join(CONVENTIONS)}"
+    )
+    option("--convention", axes_help, type=one_of(CONVENTIONS))
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
     option("--size", "HEIGHTxWIDTH in pixels; the model's own if not given")
@@ -331,7 +336,7 @@ def main(args: argparse.Namespace) -> None:
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
     with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
-            scene = load_scene(args.scene)
+            scene = load_scene(args.scene, convention=args.convention)
             photos = sampling.read_photos(
                 scene, context_ids(args.context, scene, config.max_context), config
             )
@@ -392,7 +397,8 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     elif args.scene.startswith("procedural:"):
         m = min(DEFAULT_CONTEXT, config.max_context)
     else:
-        m = len(context_ids(args.context, open_scene(args.scene), config.max_context))
+        scene = open_scene(args.scene, convention=args.convention)
+        m = len(context_ids(args.context, scene, config.max_context))
     frames = args.frames or config.frames
     adaptive = solvers.SOLVERS[settings.solver].method is None
     count = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)

@@ -9,7 +9,7 @@ from scene_files import nerfstudio, truth
 
 from roge_jax import checkpoint, entry, model, sample, sampling, video_io
 from roge_jax.config import preset
-from roge_jax.data.scene import load_scene
+from roge_jax.data.scene import load_scene, open_scene
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.geometry.trajectories import make_path
@@ -385,6 +385,22 @@ def test_path_files_are_followed(tmp_path, photos):
         arguments("--trajectory", tmp_path / "path.json"), photos.cameras, CONFIG
     )
     np.testing.assert_allclose(found.c2w, path.c2w, atol=1e-12)
+
+
+def test_convention_reaches_the_reader(place, monkeypatch):
+    seen = []
+
+    def stop(params, config, photos, *rest, **options):
+        seen.append(photos.cameras.c2w)
+        raise UserError("seen.")
+
+    monkeypatch.setattr(sampling, "sample", stop)
+    assert program(place, "--context", "0,1", "--convention", "opencv") == 2
+    expected, usual = (
+        open_scene(place / "scene", convention=name).cameras.c2w[:2] for name in ("opencv", None)
+    )
+    np.testing.assert_array_equal(seen[0], expected)
+    assert not np.allclose(expected, usual)
 
 
 # ---- dry run -------------------------------------------------------------------------------------
