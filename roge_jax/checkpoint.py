@@ -42,9 +42,11 @@ class Checkpoints:
         self._ocp = ocp
 
     def latest(self) -> int | None:
+        """The last step that was saved whole; None if there is none."""
         return self._manager.latest_step()
 
     def save(self, step: int, state: Tree) -> None:
+        """Write the state after `step` steps, and then the checksums of its files. All processes must call it."""
         self._manager.save(step, args=self._ocp.args.StandardSave(state))
         self._manager.wait_until_finished()
         if jax.process_index() == 0:
@@ -93,6 +95,7 @@ class Checkpoints:
             ) from error
 
     def close(self) -> None:
+        """Release the folder; nothing can be saved or restored afterwards."""
         self._manager.close()
 
 
@@ -314,6 +317,9 @@ def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
 
 
 def load_config(folder: Path) -> RoGeConfig:
+    """The configuration of a model or adapter folder. Raises: UserError if its config.json is damaged or of
+    another kind.
+    """
     file = Path(folder) / "config.json"
     try:
         record = json.loads(file.read_text())
@@ -323,7 +329,3 @@ def load_config(folder: Path) -> RoGeConfig:
             f"{file} is not a roge_jax model config ({error}): copy the folder again."
         ) from error
     return from_dict(values, source=str(file))
-
-
-def tree_bytes(tree: Tree) -> int:
-    return sum(int(np.prod(leaf.shape)) * leaf.dtype.itemsize for leaf in flatten(tree).values())

@@ -82,11 +82,17 @@ class DiTConfig:
 
 @dataclass(frozen=True)
 class FusionConfig:
+    """Geometry adapter between ray features and latent slots (Sec. 3.2)."""
+
     geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
 
 
 @dataclass(frozen=True)
 class FlowConfig:
+    """Flow matching: schedule shift, training noise levels and their weights, and the weight of the photometric
+    term (Sec. 3.3).
+    """
+
     shift: float = 5.0
     weighting: Literal["bump", "uniform"] = "bump"
     sigma_sampling: Literal["uniform_index", "logit_normal"] = "uniform_index"
@@ -95,6 +101,8 @@ class FlowConfig:
 
 @dataclass(frozen=True)
 class LoraConfig:
+    """Ranks of both halves and which linear layers are adapted: regular expressions for their paths."""
+
     dit_rank: int = 32
     dit_match: str = r"blocks/.*(self_attn|cross_attn)/(q|k|v|o)$|blocks/.*ffn/(fc1|fc2)$"
     recon_rank: int = 8
@@ -144,6 +152,7 @@ class RoGeConfig:
 
     @property
     def latent_size(self) -> tuple[int, int]:
+        """Height and width of the latents: an eighth of the video."""
         return self.height // 8, self.width // 8
 
     def slots(self, contexts: int) -> int:
@@ -225,6 +234,7 @@ def preset(name: str) -> RoGeConfig:
 
 
 def to_dict(config) -> dict:
+    """A configuration as nested dicts, for JSON."""
     return dataclasses.asdict(config)
 
 

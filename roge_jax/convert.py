@@ -21,6 +21,7 @@ CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mas
 
 
 def parser() -> argparse.ArgumentParser:
+    """The options of `python -m roge_jax.convert`."""
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.convert",
         description=__doc__,
@@ -82,6 +83,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: argparse.Namespace) -> None:
+    """Convert, or print what would be done. Raises: UserError with all mismatches, before anything is written."""
     from .errors import UserError
     from .weights import importer
 

@@ -248,6 +248,7 @@ class Clock:
             stage |= peak_memory()
 
     def record(self) -> dict[str, Any]:
+        """{stage: {"seconds", "peak_memory_gb", ..}}, and `total` since the clock was made."""
         total = {"seconds": time.perf_counter() - self.start} | peak_memory()
         stages = {**self.stages, "total": total}
         return {name: {k: round(v, 3) for k, v in stage.items()} for name, stage in stages.items()}

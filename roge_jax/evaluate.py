@@ -18,6 +18,7 @@ HELD_OUT = "procedural:1000000000..1000000049"
 
 
 def parser() -> argparse.ArgumentParser:
+    """The options of `python -m roge_jax.evaluate`."""
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.evaluate",
         description=__doc__,
@@ -174,6 +175,7 @@ class Evaluator:
 
 
 def main(args: argparse.Namespace) -> dict[str, Any]:
+    """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
     from .metrics import image, report

@@ -26,6 +26,7 @@ FILES = {
 
 
 def parser() -> argparse.ArgumentParser:
+    """The options of `python -m roge_jax.export`."""
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.export",
         description=__doc__,
@@ -47,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: argparse.Namespace) -> None:
+    """Write the merged model or the LoRA in the style asked for."""
     from .checkpoint import load_adapter
     from .errors import UserError
     from .weights.importer import check_output

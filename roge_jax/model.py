@@ -92,6 +92,7 @@ def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Arra
 
 
 def resized(images: jax.Array, height: int, width: int) -> jax.Array:
+    """Images [v, h, w, 3] at another size: bilinear, antialiased."""
     if images.shape[1:3] == (height, width):
         return images
     return jax.image.resize(images, (images.shape[0], height, width, 3), "bilinear", antialias=True)

@@ -28,6 +28,7 @@ LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
 
 
 def parser() -> argparse.ArgumentParser:
+    """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
     from .sampling import LONG, SCHEDULE, SLOTS, SOLVER, STEPS

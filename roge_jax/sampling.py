@@ -82,6 +82,8 @@ class Choices:
 
 
 class Planned(Protocol):
+    """What `sample` reads of a plan: `planning.plan.Plan` is one."""
+
     @property
     def choices(self) -> Choices: ...
 

@@ -23,6 +23,7 @@ def matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
 
 
 def linear_specs(d_in: int, d_out: int, axes=("embed", "mlp"), *, bias=True, init=None) -> Tree:
+    """Kernel [d_in, d_out] with logical `axes`, and bias [d_out]."""
     specs = {"kernel": Spec((d_in, d_out), axes, init or fan_in())}
     return specs | ({"bias": Spec((d_out,), axes[1:], zeros)} if bias else {})
 
@@ -36,6 +37,7 @@ def linear(p: Tree, x: jax.Array) -> jax.Array:
 
 
 def norm_specs(d: int, *, bias=True) -> Tree:
+    """Scale [d] and bias [d] of `layer_norm`; without bias, of `rms_norm`."""
     return {"scale": Spec((d,), (None,), ones)} | (
         {"bias": Spec((d,), (None,), zeros)} if bias else {}
     )
@@ -60,12 +62,14 @@ def rms_norm(p: Tree, x: jax.Array, *, eps: float) -> jax.Array:
 
 
 def gelu(x: jax.Array, *, exact: bool) -> jax.Array:
+    """x Phi(x): by erf if `exact`, else the tanh approximation."""
     if exact:  # erf and not JAX's erfc form, whose gradient costs twice as much on a CPU
         return x * (0.5 * (1.0 + jax.lax.erf(x * 0.5**0.5)))
     return jax.nn.gelu(x, approximate=True)
 
 
 def mlp_specs(d: int, hidden: int, *, bias=True, init_out=None) -> Tree:
+    """Two linears, d -> hidden -> d."""
     return {
         "fc1": linear_specs(d, hidden, ("embed", "mlp"), bias=bias),
         "fc2": linear_specs(hidden, d, ("mlp", "embed"), bias=bias, init=init_out),

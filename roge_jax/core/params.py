@@ -26,6 +26,7 @@ def fan_in(scale: float = 1.0) -> Initialiser:
 
 
 def normal(std: float) -> Initialiser:
+    """Normal with mean 0 and standard deviation `std`."""
     return lambda rng, shape, dtype: (
         np.float32(std) * rng.standard_normal(shape, np.float32)
     ).astype(dtype)
@@ -41,14 +42,17 @@ def uniform(bound: float) -> Initialiser:
 
 
 def constant(value: float) -> Initialiser:
+    """`value` everywhere."""
     return lambda rng, shape, dtype: np.full(shape, value, dtype)
 
 
 def zeros(rng, shape, dtype):
+    """0 everywhere."""
     return np.zeros(shape, dtype)
 
 
 def ones(rng, shape, dtype):
+    """1 everywhere."""
     return np.ones(shape, dtype)
 
 
@@ -62,10 +66,12 @@ class Spec(NamedTuple):
 
 
 def is_spec(x) -> bool:
+    """Whether x is a leaf of a spec tree."""
     return isinstance(x, Spec)
 
 
 def map_specs(f: Callable[[Spec], Any], specs):
+    """The tree with `f` of every spec."""
     return jax.tree.map(f, specs, is_leaf=is_spec)
 
 
@@ -80,6 +86,7 @@ def flatten(tree, prefix: str = "") -> dict[str, Any]:
 
 
 def unflatten(flat: Mapping[str, Any]) -> Tree:
+    """The inverse of `flatten`."""
     tree: Tree = {}
     for path, leaf in flat.items():
         *parents, name = path.split("/")

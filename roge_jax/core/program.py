@@ -182,6 +182,8 @@ class Held(NamedTuple):
 
 
 class Peak(NamedTuple):
+    """The fullest moment of a program: its bytes and the buffers that are alive then."""
+
     bytes: float
     held: list[Held]
 

@@ -163,6 +163,7 @@ def shardings(specs: Tree, mesh: AnyMesh) -> Tree:
 
 
 def replicated(mesh: AnyMesh) -> NamedSharding:
+    """Whole on every device of the mesh."""
     return NamedSharding(mesh, PartitionSpec())
 
 
@@ -263,6 +264,7 @@ def use(mesh: AnyMesh | None) -> Iterator[AnyMesh | None]:
 
 
 def current() -> AnyMesh | None:
+    """The mesh set by `use`; None without one."""
     return _MESH.get()
 
 

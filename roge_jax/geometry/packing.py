@@ -1,4 +1,4 @@
-"""Frames to latent slots: how rays and ray features line up with the VAE's latents (paper, 3.3).
+"""Frames to latent slots: how rays and ray features line up with the VAE's latents (Sec. 3.2 of the paper).
 
 A context is one slot, the first target frame is one slot, and every four target frames after it are
 one slot. So the contexts and the first target are repeated four times and every four frames are

@@ -17,6 +17,8 @@ SWEEP_PLANES, SWEEP_WIDTH, MIN_OVERLAP = 64, 96, 0.5
 
 
 class Warp(NamedTuple):
+    """A photo seen from another camera, and where it says anything."""
+
     rgb: (
         np.ndarray
     )  # [h, w, 3]; where invalid: the colour of the nearest point of the photo's border
@@ -164,6 +166,8 @@ def plane(
 
 
 class Sweep(NamedTuple):
+    """The plane on which the photos agree best, and how far to trust it."""
+
     depth: float  # inf if nothing can be compared: rotation only
     overlap: float  # share of the target's pixels that at least two photos see on that plane
     disagreement: float  # RMS colour difference there; NaN if nothing can be compared

@@ -11,6 +11,8 @@ from roge_jax.errors import UserError
 
 
 class FrechetDistance(NamedTuple):
+    """A distance and what it was computed from."""
+
     distance: float
     n: tuple[int, int]  # samples in each set: never compare distances of different n
     d: int  # feature width

@@ -26,6 +26,8 @@ SCALE = (0.458, 0.448, 0.450)
 
 
 class Conv(NamedTuple):
+    """One convolution of a trunk, followed by a ReLU."""
+
     key: str  # name in the official file
     shape: tuple[int, int, int, int]  # of the weight there: out, in, h, w
     stride: int = 1
@@ -35,6 +37,8 @@ class Conv(NamedTuple):
 
 
 class Trunk(NamedTuple):
+    """An image-classification network whose features LPIPS compares, and its official file."""
+
     name: str
     file: str  # the eight hex digits in the name begin its SHA-256
     origin: str

@@ -31,6 +31,9 @@ EPS = 1e-5
 
 
 def attention_specs(d: int, heads: int, *, depth: int) -> Tree:
+    """Attention of width d without biases, q and k normalised per head; `depth` scales the output's initial
+    values.
+    """
     return {
         "q": linear_specs(d, d, ("embed", "heads"), bias=False),
         "k": linear_specs(d, d, ("embed", "heads"), bias=False),
@@ -82,6 +85,7 @@ def _keys(r: Relative, t: jax.Array) -> jax.Array:
 
 
 def cross_block_specs(d: int, heads: int, depth: int) -> Tree:
+    """Rays: self-attention, cross-attention to the scene, MLP."""
     return {
         "norm_self": norm_specs(d, bias=False),
         "self_attn": attention_specs(d, heads, depth=depth),
@@ -94,6 +98,7 @@ def cross_block_specs(d: int, heads: int, depth: int) -> Tree:
 
 
 def bidirectional_block_specs(d: int, heads: int, depth: int) -> Tree:
+    """A cross block in which the scene then reads the rays: the published form."""
     return cross_block_specs(d, heads, depth) | {
         "scene_attn": attention_specs(d, heads, depth=depth),
         "norm_scene_mlp": norm_specs(d, bias=False),
@@ -102,6 +107,7 @@ def bidirectional_block_specs(d: int, heads: int, depth: int) -> Tree:
 
 
 def full_block_specs(d: int, heads: int, depth: int) -> Tree:
+    """One sequence of rays and scene: self-attention, MLP."""
     return {
         "norm_self": norm_specs(d, bias=False),
         "self_attn": attention_specs(d, heads, depth=depth),
@@ -186,6 +192,7 @@ def merge_scene(
 
 
 def renderer_specs(cfg: RendererConfig) -> Tree:
+    """Leaves of ray embedding, registers, `cfg.depth` blocks of the form `cfg.attention`, and RGB head."""
     d, heads, depth = cfg.width, cfg.heads, cfg.depth
     specs = {
         "registers": Spec((cfg.registers, d), (None, "embed"), normal(0.02)),

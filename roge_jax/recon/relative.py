@@ -58,6 +58,7 @@ def relative_cameras(
         ],
         -1,
     )
+    c2w = jnp.asarray(c2w)
     rotation, origin = c2w[:, :3, :3], c2w[:, :3, 3]
     back = jnp.swapaxes(rotation, 1, 2)
     w2c = c2w.at[:, :3, :3].set(back).at[:, :3, 3].set(-jnp.einsum("vij,vj->vi", back, origin))
@@ -87,14 +88,16 @@ def _apply(matrices: jax.Array | None, angles: jax.Array, x: jax.Array) -> jax.A
 
 
 def to_query(r: Relative, q: jax.Array) -> jax.Array:
+    """Queries q [v, l, k, e]: P_a^T and the token's rotation, so that q . k depends on P_a P_b^-1 alone."""
     turned = None if r.project is None else jnp.swapaxes(r.project, 1, 2)
     return _apply(turned, r.angles, q)
 
 
 def to_key(r: Relative, k: jax.Array) -> jax.Array:
-    """Keys and values."""
+    """Keys and values k [v, l, k, e]: P_b^-1 and the token's rotation."""
     return _apply(r.unproject, r.angles, k)
 
 
 def to_output(r: Relative, y: jax.Array) -> jax.Array:
+    """Attention's sums of values y [v, l, k, e] into the querying view: P_a and the rotation undone."""
     return _apply(r.project, -r.angles, y)

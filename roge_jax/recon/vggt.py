@@ -37,6 +37,7 @@ SPECIALS = 1  # camera token in front of the registers
 
 
 def block_specs(d: int, heads: int, *, qk_norm: bool, depth: int) -> Tree:
+    """Pre-norm attention and MLP with layer scale; `depth` scales the initial values of the outputs."""
     out = fan_in((2 * depth) ** -0.5)
     attn = {
         "qkv": linear_specs(d, 3 * d, ("embed", "heads")),
@@ -69,6 +70,7 @@ def block(
 
 
 def self_attention(p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None, relative=None):
+    """Attention of x [v, l, d] within each view or, with `relative`, over all views at once; the same shape."""
     q, k, v = (split_heads(t, heads) for t in jnp.split(linear(p["qkv"], x), 3, axis=-1))
     if "q_norm" in p:
         q, k = layer_norm(p["q_norm"], q, eps=eps), layer_norm(p["k_norm"], k, eps=eps)
@@ -88,6 +90,7 @@ def self_attention(p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None
 
 
 def dino_specs(cfg: EncoderConfig) -> Tree:
+    """Leaves of DINOv2 with registers (the `cfg.dino_depth` blocks in front of the alternating stack)."""
     d, tokens = cfg.width, cfg.position_grid**2 + 1
     return {
         "patch_embed": patch_conv_specs(cfg.patch, 3, d),
@@ -171,6 +174,7 @@ def encoder_size(cfg: EncoderConfig, height: int, width: int) -> tuple[int, int]
 
 
 def encoder_grid(cfg: EncoderConfig, height: int, width: int) -> tuple[int, int]:
+    """Rows and columns of the patch tokens of an image of height x width."""
     h, w = encoder_size(cfg, height, width)
     return h // cfg.patch, w // cfg.patch
 

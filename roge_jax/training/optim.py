@@ -19,6 +19,8 @@ ADAM_ONLY = (
 
 @dataclass(frozen=True)
 class OptimConfig:
+    """AdamW or Muon, learning rate and its schedule, clipping, accumulation, average of the weights."""
+
     name: Literal["adamw", "muon"] = "adamw"
     learning_rate: float = 1e-4
     warmup: int = 100

@@ -52,10 +52,12 @@ class Plan:
 
     @property
     def bytes(self) -> float:
+        """All that one device holds at its fullest."""
         return sum(self.memory.values())
 
     @property
     def flops(self) -> float:
+        """FLOPs of one device and step."""
         return sum(sum(passes.values()) for passes in self.work.values())
 
 
@@ -193,6 +195,7 @@ def part(scope: str) -> str:
 
 
 def which_pass(scope: str) -> str:
+    """forward, recomputed or backward: the pass that an operation belongs to."""
     if "rematted_computation" in scope:
         return "recomputed"
     return "backward" if "transpose(" in scope else "forward"

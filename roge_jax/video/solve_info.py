@@ -28,6 +28,7 @@ class SolveInfo:
 
     @property
     def failed(self) -> Array:
+        """Whether the run stopped early, bool []."""
         return self.cause != FINE
 
 
@@ -51,6 +52,7 @@ def raise_if_failed(info: SolveInfo) -> None:
 
 
 def fresh_info(size: int, dtype) -> SolveInfo:
+    """A run that has not begun, of a state with `size` numbers of `dtype`."""
     zero = jnp.int32(0)
     sigma = jnp.zeros((), jnp.promote_types(dtype, jnp.float32))
     return SolveInfo(zero, zero, jnp.int32(FINE), jnp.int32(-1), sigma, zero, jnp.int32(size))

@@ -58,6 +58,7 @@ class Step:
 
     @property
     def h(self) -> float:
+        """Length of the step, negative: sigma falls."""
         return self.s1 - self.s0
 
 

@@ -68,6 +68,7 @@ def _conv(x: jax.Array, kernel: jax.Array, *, stride=1, padding=((1, 1), (1, 1))
 
 
 def conv_specs(c_in: int, c_out: int, taps: tuple[int, ...]) -> Tree:
+    """Kernel [*taps, c_in, c_out] and bias of a convolution."""
     kernel = Spec((*taps, c_in, c_out), (None,) * (len(taps) + 2), fan_in())
     return {"kernel": kernel, "bias": Spec((c_out,), (None,), zeros)}
 
@@ -86,6 +87,7 @@ def rms_norm(p: Tree, x: jax.Array) -> jax.Array:
 
 # ----------------------------------------------------------------------------------------------------------- blocks
 def res_specs(c_in: int, c_out: int) -> Tree:
+    """Two causal convolutions with norms, and a linear shortcut if the channels change."""
     specs = {
         "norm1": norm_specs(c_in, bias=False),
         "conv1": conv_specs(c_in, c_out, (3, 3, 3)),
@@ -98,6 +100,7 @@ def res_specs(c_in: int, c_out: int) -> Tree:
 
 
 def res_block(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
+    """x [t, h, w, c] -> [t, h, w, c_out] and what the next chunk needs."""
     new = {}
     y = jax.nn.silu(rms_norm(p["norm1"], x))
     y, new["conv1"] = causal_conv(p["conv1"], y, _of(past, "conv1"))
@@ -107,6 +110,7 @@ def res_block(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
 
 
 def attn_specs(c: int) -> Tree:
+    """Leaves of `attn_block`."""
     return {
         "norm": norm_specs(c, bias=False),
         "qkv": linear_specs(c, 3 * c, (None, None)),
@@ -123,10 +127,12 @@ def attn_block(p: Tree, x: jax.Array) -> jax.Array:
 
 
 def mid_specs(c: int) -> Tree:
+    """Residual block, attention, residual block."""
     return {"res0": res_specs(c, c), "attn": attn_specs(c), "res1": res_specs(c, c)}
 
 
 def mid_block(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
+    """x [t, h, w, c] -> the same shape, and what the next chunk needs."""
     new = {}
     x, new["res0"] = res_block(p["res0"], x, _of(past, "res0"))
     x = attn_block(p["attn"], x)
@@ -135,6 +141,7 @@ def mid_block(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
 
 
 def down_specs(c: int, temporal: bool) -> Tree:
+    """A strided convolution in space and, if `temporal`, one in time."""
     specs = {"conv": conv_specs(c, c, (3, 3))}
     return specs | ({"time": conv_specs(c, c, (3,))} if temporal else {})
 
@@ -156,6 +163,7 @@ def down(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
 
 
 def up_specs(c: int, temporal: bool) -> Tree:
+    """A convolution in space that halves the channels and, if `temporal`, one that doubles time."""
     specs = {"conv": conv_specs(c, c // 2, (3, 3))}
     return specs | ({"time": conv_specs(c, 2 * c, (3,))} if temporal else {})
 
@@ -202,6 +210,7 @@ def _widths(cfg: VAEConfig) -> list[int]:
 
 
 def encoder_specs(cfg: VAEConfig) -> Tree:
+    """Leaves of `encoder`: `cfg.multipliers` stages, middle, head of mean and log-variance."""
     widths = _widths(cfg)
     specs = {"conv_in": conv_specs(3, widths[0], (3, 3, 3))}
     for i, (c_in, c) in enumerate(zip([widths[0], *widths], widths, strict=False)):
@@ -226,6 +235,7 @@ def encoder(p: Tree, x: jax.Array, past: Past, *, cfg: VAEConfig) -> tuple[jax.A
 
 
 def decoder_specs(cfg: VAEConfig) -> Tree:
+    """Leaves of `decoder`: the encoder's stages backwards, with one residual block more each."""
     widths, temporal = _widths(cfg)[::-1], cfg.temporal[::-1]
     specs = {"conv_in": conv_specs(cfg.latent, widths[0], (3, 3, 3)), "mid": mid_specs(widths[0])}
     for i, c in enumerate(widths):
@@ -263,6 +273,7 @@ def _stages(p: Tree, x: jax.Array, past: Past, resample, name: str, blocks: int)
 
 
 def vae_specs(cfg: VAEConfig) -> Tree:
+    """Leaves of the whole VAE."""
     return {
         "encoder": encoder_specs(cfg),
         "quant": linear_specs(2 * cfg.latent, 2 * cfg.latent, (None, None)),

@@ -69,9 +69,11 @@ class Plan(NamedTuple):
         return [path for path in self.specs if path not in filled]
 
     def dtype(self, path: str) -> np.dtype:
+        """What a leaf is stored as."""
         return HALF if self.half and stored_half(path) else DTYPES["F32"]
 
     def layout(self, shard_bytes: float = SHARD_BYTES) -> Layout:
+        """Where every leaf lies in files of at most `shard_bytes`."""
         return plan_shards(
             {p: (s.shape, self.dtype(p)) for p, s in self.specs.items()}, shard_bytes
         )

@@ -19,6 +19,8 @@ from ..errors import UserError
 
 
 class Transform(NamedTuple):
+    """Two inverse functions on arrays that only move or drop axes."""
+
     to_ours: Callable[[np.ndarray], np.ndarray]
     to_theirs: Callable[[np.ndarray], np.ndarray]
 

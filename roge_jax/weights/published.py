@@ -245,6 +245,7 @@ class _Adapter:
 
 
 def fill_vae(cfg: VAEConfig, source: Source, role: str = "--wan-vae") -> Filled:
+    """Fill `vae` from a Wan2.1 VAE, official or diffusers names."""
     expect(source, ("vae",), role, "the Wan2.1 VAE")
     names = {key: key for key in source.tensors}
     naming: wan_vae.Names = "diffusers" if "quant_conv.weight" in names else "official"

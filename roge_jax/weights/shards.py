@@ -28,6 +28,8 @@ TILE = 256  # rows and columns copied at a time when transposing
 
 
 class Place(NamedTuple):
+    """Where a leaf lies."""
+
     shard: int
     offset: int  # in the file
     shape: tuple[int, ...]
@@ -35,11 +37,14 @@ class Place(NamedTuple):
 
 
 class Layout(NamedTuple):
+    """The files of a model folder before they are written: headers, sizes, and the place of every leaf."""
+
     headers: list[bytes]
     sizes: list[int]  # bytes of each file
     places: dict[str, Place]
 
     def name(self, shard: int) -> str:
+        """File name of shard number `shard`, from 0."""
         return f"model-{shard + 1:05d}-of-{len(self.sizes):05d}.safetensors"
 
 
@@ -125,6 +130,7 @@ class Shards:
             os.fsync(file.fileno())
 
     def close(self) -> None:
+        """Close all files; what was written stays."""
         for file in self.files:
             with contextlib.suppress(OSError):
                 file.close()

@@ -89,6 +89,7 @@ class Stored(NamedTuple):
 
     @property
     def nbytes(self) -> int:
+        """Bytes of the tensor."""
         return math.prod(self.shape) * self.dtype.itemsize
 
 
@@ -100,14 +101,17 @@ class Source(NamedTuple):
 
     @property
     def files(self) -> list[Path]:
+        """The files that hold the tensors."""
         return sorted({t.file for t in self.tensors.values()})
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
+        """{key: shape}."""
         return {key: t.shape for key, t in self.tensors.items()}
 
     @property
     def nbytes(self) -> int:
+        """Bytes of all tensors."""
         return sum(t.nbytes for t in self.tensors.values())
 
     def read(self, key: str) -> np.ndarray:
