@@ -99,7 +99,10 @@ def parser() -> argparse.ArgumentParser:
         "noise level (joint stages)",
     )
     p.add_argument(
-        "--evaluate-every", type=int, default=0, help="steps between evaluations on held-out scenes"
+        "--evaluate-every",
+        type=int,
+        default=0,
+        help="steps between evaluations on 16 held-out scenes; also one before the first step",
     )
     p.add_argument(
         "--tensorboard", action="store_true", help="also write TensorBoard events (extra 'log')"
@@ -165,6 +168,8 @@ def starting_point(args: argparse.Namespace) -> str:
 
 def choose(args: argparse.Namespace, cfg):
     """(the configuration at --size, the stages that --stage means with everything that the flags change)."""
+    from . import model
+    from .core.params import count
     from .training import plan
     from .training import stages as stages_
 
@@ -173,6 +178,8 @@ def choose(args: argparse.Namespace, cfg):
         chosen = recipe
     elif args.stage in ("lora", "hires"):
         chosen = [stages_.lora_stage(200, frames=cfg.frames, hires=args.stage == "hires")]
+        if count(model.specs(cfg)) < plan.LARGE:
+            chosen = [stages_.for_one_scene(chosen[0])]
     else:
         chosen = [stages_.find_stage(recipe, args.stage)]
     if args.stage == "hires" or args.size:
@@ -385,7 +392,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
         if stage.lora:
             base = {"base": args.init or args.preset, "data": str(args.data or "procedural scenes")}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance | base)
-    say(f"{stage.name}: saved {out / 'model'}")
+    say(f"{stage.name}: saved {out / 'model'}{loop.held_out_change(out / 'log.jsonl')}")
     return params, cfg
 
 

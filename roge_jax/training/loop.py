@@ -37,6 +37,8 @@ class TrainingStopped(RuntimeError):
 
 @dataclass(frozen=True)
 class LoopConfig:
+    """How long a run is, what it writes how often, and when it gives up."""
+
     steps: int = 100
     seed: int = 0
     log_every: int = 10
@@ -114,6 +116,7 @@ class DivergenceDetector:
         self.best, self.best_spread, self.beyond = float("inf"), 0.0, 0
 
     def update(self, loss: float) -> bool:
+        """Take in the loss of a step; whether the run has diverged."""
         if not np.isfinite(loss):
             return False  # skipped steps have their own limit
         self.seen += 1
@@ -190,8 +193,8 @@ def train(
     says (frozen ones on every device without `frozen_specs`). In a run of several processes `batches(i)` returns this
     process' `core.distributed.local_rows` of the `batch` scenes; the main process writes the log.
 
-    `evaluate(params)` of the averaged parameters is logged every `evaluate_every` steps and stops the run when it is
-    not finite.
+    `evaluate(params)` of the averaged parameters is logged before the first step and every `evaluate_every` steps, and
+    stops the run when it is not finite.
     `diagnose(params, frozen, batch, key)` (see `training.diagnose`) is logged every `diagnose_every` steps. `writer`
     has TensorBoard's `add_scalar`.
 
@@ -248,6 +251,9 @@ def train(
         source as ready,
         sharding.use(mesh),
     ):
+        if evaluate and evaluate_every and first == 0:
+            before = evaluate(state.get("ema", state["params"]))
+            log.write(json.dumps({"step": 0} | _finite(before)) + "\n")
         for i, views in enumerate(ready, first):
             if mesh is not None:
                 views = global_batch(views, mesh, batch or len(next(iter(views.values()))))
@@ -297,6 +303,16 @@ def train(
             if due(loop.save_every) and not suspect:
                 checkpoints.save(done, state)
     return state
+
+
+def held_out_change(log: Path) -> str:
+    """What a run's log says of the held-out loss, as the end of a sentence; empty without evaluations."""
+    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    found = [(row["step"], row["held_loss"]) for row in rows if row.get("held_loss") is not None]
+    if len(found) < 2:
+        return ""
+    (first, before), (last, after) = found[0], found[-1]
+    return f"; held-out loss {before:.4g} at step {first}, {after:.4g} at step {last}"
 
 
 def _check_fits(folder: Path, step: int, state: Tree) -> None:
