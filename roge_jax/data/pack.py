@@ -75,14 +75,15 @@ def pack(
         raise UserError(f"{out} is not empty: give a new folder.")
     out.mkdir(parents=True, exist_ok=True)
     size = {"frames": frames, "height": height, "width": width}
-    found = []
+    found, total = [], 0
     for number, spec in enumerate(scenes):
         scene = load_scene(spec, convention=convention)
         count = pack_scene(scene, out / f"shard_{number:05d}", **size)
+        total += count
         found.append({"scene": str(spec), "views": len(scene), "sequences": count})
         print(f"{spec}: {len(scene)} views, {count} sequences", flush=True)
     (out / "pool.json").write_text(json.dumps(size | {"scenes": found}, indent=1) + "\n")
-    return sum(entry["sequences"] for entry in found)
+    return total
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
