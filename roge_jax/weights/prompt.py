@@ -11,7 +11,7 @@ from ..config import DiTConfig
 from ..errors import UserError
 from .sources import open_source
 
-EXTRA = 'pip install "roge_jax[convert]" torch'
+EXTRA = "pip install -e '.[convert]' in the project's folder"
 
 
 def padded(rows: np.ndarray, cfg: DiTConfig, source: str) -> np.ndarray:
