@@ -1,0 +1,120 @@
+"""The pages keep up with the code: links and anchors lead somewhere, commands and options exist, charts are listed."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from roge_jax import convert, entry, evaluate, export, sample, train
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PARSERS = {
+    "sample": sample,
+    "train": train,
+    "evaluate": evaluate,
+    "convert": convert,
+    "export": export,
+}
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as code hosts make them."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def commands(text: str) -> list[tuple[str, list[str]]]:
+    """(program, words) of every `python -m roge_jax.PROGRAM ...`, up to the end of its line or code span."""
+    found = re.findall(r"python -m roge_jax\.(\w+)((?: [^`\n#;]*)?)", text)
+    return [(name, shlex.split(re.split(r"\s{3,}", rest, maxsplit=1)[0])) for name, rest in found]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    faults = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = page.parent / path if path else page
+        if not target.exists():
+            faults.append(link)
+        elif anchor and anchor not in anchors(target):
+            faults.append(f"{link}: there is {sorted(anchors(target))}")
+    assert not faults, faults
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_options_exist(page):
+    known = {
+        name: {word for action in module.parser()._actions for word in action.option_strings}
+        for name, module in PARSERS.items()
+    }
+    faults = [
+        f"{name} {word}"
+        for name, words in commands(page.read_text())
+        for word in words
+        if name in known and word.startswith("--") and word.partition("=")[0] not in known[name]
+    ]
+    assert not faults, faults
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_files_named_in_the_text_exist(page):
+    pattern = r"(?:experiments|tests|notebooks|roge_jax)/[\w/]+\.(?:py|json|ipynb|md|png)"
+    faults = [name for name in re.findall(pattern, page.read_text()) if not (ROOT / name).exists()]
+    expected = {"experiments/results/train_profile.json"}  # written by a command
+    assert not set(faults) - expected, faults
+
+
+def test_every_option_of_sample_is_explained():
+    text = (ROOT / "docs" / "sampling.md").read_text()
+    options = [action.option_strings[-1] for action in sample.parser()._actions]
+    missing = [name for name in options if name != "--help" and f"`{name}`" not in text]
+    assert not missing, missing
+
+
+def test_every_option_of_train_is_explained():
+    text = (ROOT / "docs" / "training.md").read_text() + (ROOT / "docs" / "scaling.md").read_text()
+    options = [a.option_strings[-1] for a in train.parser()._actions if a.option_strings]
+    missing = [name for name in options if name != "--help" and f"{name}" not in text]
+    assert not missing, missing
+
+
+def test_every_chart_and_experiment_can_be_made_again():
+    text = (ROOT / "docs" / "figures.md").read_text()
+    charts = [*(ROOT / "docs").glob("*.png"), *(ROOT / "experiments" / "results").glob("*.png")]
+    programs = [
+        file
+        for file in (ROOT / "experiments").glob("*.py")
+        if '__name__ == "__main__"' in file.read_text()
+    ]
+    assert len(charts) > 10 and len(programs) > 10
+    missing = [file.name for file in charts + programs if file.name not in text]
+    assert not missing, missing
+
+
+def test_every_page_is_listed_in_the_readme():
+    text = (ROOT / "README.md").read_text()
+    missing = [page.name for page in PAGES[1:] if f"docs/{page.name}" not in text]
+    assert not missing, missing
+
+
+def test_every_setting_from_the_environment_is_explained():
+    used = set()
+    for file in (ROOT / "roge_jax").rglob("*.py"):
+        used |= set(re.findall(r'"(ROGE_[A-Z]+)"', file.read_text()))
+    text = "".join(page.read_text() for page in PAGES)
+    assert used and all(name in text for name in used), used
+
+
+def test_the_checks_see_faults(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# A title: one\n\n`python -m roge_jax.sample --nothing` and more --other\n")
+    assert anchors(page) == {"a-title-one"}
+    assert commands(page.read_text()) == [("sample", ["--nothing"])]
+    with pytest.raises(Exception, match="nothing"):
+        entry.parse(sample.parser(), ["--nothing"])
