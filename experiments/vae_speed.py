@@ -18,6 +18,7 @@ The published system reports no such number. Our numbers: see the JSON file, whi
 the first three clips (the full-width clip was not finished when it was written).
 """
 
+import argparse
 import functools
 import json
 import os
@@ -283,6 +284,11 @@ def main(core: int = 0, repeats: int = 7, clips: tuple[str, ...] = (), out: Path
 
 
 if __name__ == "__main__":
-    import tyro
-
-    tyro.cli(main)
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--core", type=int, default=0, help="the CPU core to run on (default: 0)")
+    p.add_argument("--repeats", type=int, default=7)
+    p.add_argument("--clips", nargs="+", default=(), help="these clips (default: all)")
+    p.add_argument("--out", type=Path, default=RESULTS)
+    main(**vars(p.parse_args()))

@@ -6,10 +6,12 @@ SCENE is a folder or file in any layout that `data.readers` knows, `motorcycle` 
 `procedural:SEED`. Exit code 0 if the scene can be used, 2 if not.
 """
 
+import argparse
 import dataclasses
 import json
 import sys
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ import numpy as np
 
 from roge_jax.data.matching import pose_agreement
 from roge_jax.data.scene import Scene, open_scene
+from roge_jax.entry import execute, number, one_of, plain
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import (
     CONVENTIONS,
@@ -40,22 +43,15 @@ BAD_FIT = (
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Checks a scene."""
+    """What `check` looks at; the options of the program (`parser`) explain the fields."""
 
     scene: str
-    """A scene folder or file, `motorcycle` or `procedural:SEED`."""
     json: bool = False
-    """Print the report as JSON."""
     convention: str | None = None
-    """Axes of the poses of a transforms.json: opencv, opencv_w2c, opengl or opengl_w2c."""
     height: int = 192
-    """Height of the pictures to be made, to say how much of a photo the crop keeps."""
     width: int = 336
-    """Width of the pictures to be made."""
     matching: bool = True
-    """Compare the poses with matched features of the photos (a few seconds)."""
     debug: bool = False
-    """Show where in the program an error comes from."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,33 +258,42 @@ def main(config: Config) -> int:
         report = check(config)
     if config.json:
         content = dataclasses.asdict(report) | {"usable": report.usable}
-        print(json.dumps(_plain(content), indent=1, allow_nan=False))
+        print(json.dumps(plain(content), indent=1, allow_nan=False))
     else:
         print(render(report))
     return 0 if report.usable else 2
 
 
-def _plain(value: Any) -> Any:
-    """NaN and infinity are no JSON: they become null."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def parser() -> argparse.ArgumentParser:
+    """The options of `python -m roge_jax.check`."""
+    p = argparse.ArgumentParser(
+        prog="python -m roge_jax.check",
+        description=__doc__,
+        formatter_class=argparse.RawTextHelpFormatter,
+    )
+    p.add_argument("scene", help="a scene folder or file, motorcycle or procedural:SEED")
+    p.add_argument("--json", action="store_true", help="print the report as JSON")
+    p.add_argument(
+        "--convention",
+        type=one_of(CONVENTIONS),
+        help=f"axes of the poses of a transforms.json: {', '.join(CONVENTIONS)}",
+    )
+    size = "of the pictures to be made, to say how much of a photo the crop keeps (default: {})"
+    p.add_argument("--height", type=number(1), default=192, help=size.format(192))
+    p.add_argument("--width", type=number(1), default=336, help=size.format(336))
+    p.add_argument(
+        "--matching",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="compare the poses with matched features of the photos (a few seconds)",
+    )
+    p.add_argument("--debug", action="store_true", help="show where an error comes from")
+    return p
 
 
-def cli(arguments: list[str] | None = None) -> int:
+def cli(arguments: Sequence[str] | None = None) -> int:
     """The command line: exit code 2 and one sentence for mistakes."""
-    import tyro
-
-    config = tyro.cli(tyro.conf.PositionalRequiredArgs[Config], args=arguments)
-    try:
-        return main(config)
-    except UserError as error:
-        if config.debug:
-            raise
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return execute(lambda args: main(Config(**vars(args))), parser(), arguments)
 
 
 if __name__ == "__main__":

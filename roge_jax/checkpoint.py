@@ -139,6 +139,11 @@ def save_model(
         save_file(shard, temporary / f"model-{i:05d}-of-{len(shards):05d}.safetensors")
     record = {"format": 1, "config": to_dict(config), "provenance": provenance or {}}
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
+    _put(temporary, folder)
+
+
+def _put(temporary: Path, folder: Path) -> None:
+    """Rename a finished folder to `folder`; what was there is gone only then."""
     old = folder.with_name(folder.name + ".old")
     shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
@@ -259,12 +264,7 @@ def save_adapter(
     }
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
     (temporary / "README.md").write_text(adapter_card(leaves, config, provenance or {}))
-    old = folder.with_name(folder.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    temporary.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    _put(temporary, folder)
 
 
 def load_adapter(folder: str | Path) -> tuple[Tree, RoGeConfig]:

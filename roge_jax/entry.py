@@ -327,17 +327,18 @@ def write_json(file: Path, content: Any) -> None:
     """JSON with one temporary name, so that the file is whole or absent. NaN and infinity become null."""
     file = Path(file)
     temporary = file.with_name(file.name + ".part")
-    temporary.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
+    temporary.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
     temporary.replace(file)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """A value as JSON has it: arrays and tuples as lists, paths as text, NaN and infinity as null."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, Path):
         return str(value)
     return (

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from roge_jax import convert, entry, evaluate, export, sample, train
+from roge_jax import check, convert, entry, evaluate, export, sample, train
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 PARSERS = {
+    "check": check,
     "sample": sample,
     "train": train,
     "evaluate": evaluate,

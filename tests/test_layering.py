@@ -36,7 +36,7 @@ ALLOWED = {
     "planning": _PARTS | {"model", "data", "cost", "windows", "sampling"},
 }
 # Programs and their helpers may import anything but other programs.
-PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "view", "check"}
+PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check"}
 LIGHT = {
     "jax",
     "ml_dtypes",

@@ -20,7 +20,7 @@ from ..core.params import Tree, flatten
 from ..errors import UserError
 from ..recon.ray_scene import renderer_specs
 from ..recon.vggt import dino_specs, encoder_specs
-from .mapping import CONV2D, IDENTITY, LINEAR, Entry, Transform, leading_ones, to_theirs
+from .mapping import CONV2D, IDENTITY, LINEAR, Entry, Transform, bare, leading_ones, to_theirs
 
 VGGT = "reconstructor.vggt."  # in front of VGGT's own names inside LagerNVS
 PREFIXES = ("module.", "model.")  # left by data-parallel wrappers and training programs
@@ -172,13 +172,7 @@ def _renderer_entry(path: str, cfg: RendererConfig, ours: str, theirs: str) -> E
 
 def source(tensors: Mapping) -> dict:
     """The tensors under bare names: known prefixes stripped, VGGT's heads left out."""
-    bare = {}
-    for key, value in tensors.items():
-        for prefix in PREFIXES:
-            key = key.removeprefix(prefix)
-        if not re.search(IGNORED, key):
-            bare[key] = value
-    return bare
+    return bare(tensors, PREFIXES, IGNORED)
 
 
 def published(

@@ -9,7 +9,8 @@ the layout of `core.params.stack`. Transforms are pairs of inverse functions on 
 axes, so both directions are exact. `to_ours` and `to_theirs` convert whole trees; `source_shapes` needs no values.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,17 @@ class Transform(NamedTuple):
 
     to_ours: Callable[[np.ndarray], np.ndarray]
     to_theirs: Callable[[np.ndarray], np.ndarray]
+
+
+def bare(tensors: Mapping, prefixes: Sequence[str], ignored: str) -> dict:
+    """The tensors without `prefixes` of their names, and without those whose bare name matches `ignored`."""
+    found = {}
+    for key, value in tensors.items():
+        for prefix in prefixes:
+            key = key.removeprefix(prefix)
+        if not re.search(ignored, key):
+            found[key] = value
+    return found
 
 
 def permute(*axes: int) -> Transform:

@@ -19,7 +19,7 @@ from ..config import DiTConfig
 from ..core.params import Tree, flatten
 from ..errors import UserError
 from ..video.dit import dit_specs
-from .mapping import IDENTITY, LINEAR, Entry, Transform, leading_ones
+from .mapping import IDENTITY, LINEAR, Entry, Transform, bare, leading_ones
 
 Names = Literal["official", "diffusers"]
 
@@ -135,13 +135,7 @@ def naming(keys: Iterable[str]) -> Names:
 
 def source(tensors: Mapping) -> dict:
     """The tensors under bare names: known prefixes stripped, keys that no implementation reads left out."""
-    bare = {}
-    for key, value in tensors.items():
-        for prefix in PREFIXES:
-            key = key.removeprefix(prefix)
-        if not re.search(IGNORED, key):
-            bare[key] = value
-    return bare
+    return bare(tensors, PREFIXES, IGNORED)
 
 
 def dit_config(shapes: Mapping[str, tuple[int, ...]]) -> DiTConfig:
