@@ -43,8 +43,9 @@ class RendererConfig:
     depth: int = 12
     registers: int = 4
     attention: Literal["bidirectional", "cross", "full"] = "bidirectional"
-    refinement: Literal["per_view", "shared"] = "per_view"  # whose scene tokens the rays refine
-    relative_cameras: bool = False
+    # Of bidirectional attention: scene tokens refined for every queried view, or once by the contexts' rays.
+    refinement: Literal["per_view", "shared"] = "per_view"
+    relative_cameras: bool = False  # projective relative-camera attention; "full" attention has none
     chunk: int = 8  # views processed at a time
     merge: Literal[1, 2, 4] = 1  # scene tokens of a photo averaged into one: 2 in a row, 2 x 2
 
