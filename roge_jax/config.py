@@ -45,7 +45,7 @@ class RendererConfig:
     attention: Literal["bidirectional", "cross", "full"] = "bidirectional"
     # Of bidirectional attention: scene tokens refined for every queried view, or once by the contexts' rays.
     refinement: Literal["per_view", "shared"] = "per_view"
-    relative_cameras: bool = False  # projective relative-camera attention; "full" attention has none
+    relative_cameras: bool = False  # projective; "full" attention has no such form
     chunk: int = 8  # views processed at a time
     merge: Literal[1, 2, 4] = 1  # scene tokens of a photo averaged into one: 2 in a row, 2 x 2
 
