@@ -175,7 +175,7 @@ def train(
     *,
     optim: OptimConfig,
     loop: LoopConfig,
-    out: Path,
+    out: str | Path,
     resume: bool = False,
     mesh: jax.sharding.Mesh | None = None,
     frozen_specs: Tree | None = None,
@@ -189,9 +189,10 @@ def train(
 ) -> Tree:
     """Run `loop.steps` steps; returns the final state. Logs to out/log.jsonl, checkpoints in out/checkpoints.
 
-    `specs` are those of `trainable`. With a `mesh` (see `core.sharding`) state and frozen weights lie where its table
-    says (frozen ones on every device without `frozen_specs`). In a run of several processes `batches(i)` returns this
-    process' `core.distributed.local_rows` of the `batch` scenes; the main process writes the log.
+    `specs` are those of `trainable`. The caller's arrays stay valid, but for those that lie on a `mesh` already. With a
+    `mesh` (see `core.sharding`) state and frozen weights lie where its table says (frozen ones on every device without
+    `frozen_specs`). In a run of several processes `batches(i)` returns this process' `core.distributed.local_rows` of
+    the `batch` scenes; the main process writes the log.
 
     `evaluate(params)` of the averaged parameters is logged before the first step and every `evaluate_every` steps, and
     stops the run when it is not finite.
@@ -202,8 +203,11 @@ def train(
     """
     from ..checkpoint import Checkpoints
 
+    out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     optimiser = make_optimiser(optim, specs, loop.steps)
+    if mesh is None:  # the step donates its state: the caller keeps these arrays
+        trainable = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), trainable)
     state = initial_state(trainable, optimiser, optim)
     where = None
     if mesh is not None:
