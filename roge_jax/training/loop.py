@@ -256,7 +256,7 @@ def train(
         sharding.use(mesh),
     ):
         if evaluate and evaluate_every and first == 0:
-            before = evaluate(state.get("ema", state["params"]))
+            before = evaluate(state["ema"] if "ema" in state else state["params"])
             log.write(json.dumps({"step": 0} | _finite(before)) + "\n")
         for i, views in enumerate(ready, first):
             if mesh is not None:
