@@ -15,6 +15,7 @@ class LimitWarning(UserWarning):
 def did_you_mean(word: str, options: Iterable[str]) -> str:
     """A sentence fragment listing `options`, led by the closest one to `word` if any is close."""
     options = sorted(options)
-    close = difflib.get_close_matches(word, options, n=1, cutoff=0.5)
-    hint = f"did you mean '{close[0]}'? " if close else ""
+    by_lower = {option.lower(): option for option in reversed(options)}
+    close = difflib.get_close_matches(str(word).lower(), by_lower, n=1, cutoff=0.5)
+    hint = f"did you mean '{by_lower[close[0]]}'? " if close else ""
     return f"{hint}Allowed: {', '.join(options)}."

@@ -194,6 +194,23 @@ def test_colour_modes(tmp_path):
     np.testing.assert_allclose(pixels, corners[..., [1, 0, 2]], atol=12)
 
 
+def test_large_and_rare_pictures(tmp_path, monkeypatch):
+    """Above Pillow's soft limit: no warning. Above the hard one, CMYK or Lab in a TIFF: refused by name."""
+    from PIL import Image
+
+    photo = Image.fromarray(picture(0))
+    photo.save(tmp_path / "large.png")
+    for mode in ("CMYK", "LAB"):
+        photo.convert(mode).save(tmp_path / f"{mode}.tif")
+        with pytest.raises(UserError, match=rf"{mode}.tif: .*{mode}"):
+            read_image(tmp_path / f"{mode}.tif")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", HEIGHT * WIDTH - 1)
+    np.testing.assert_allclose(read_image(tmp_path / "large.png") * 255, picture(0), atol=1e-4)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", HEIGHT * WIDTH // 2 - 1)
+    with pytest.raises(UserError, match=r"large.png: has more than 958 pixels: make it smaller"):
+        read_image(tmp_path / "large.png")
+
+
 def swapped_profile() -> bytes:
     """An ICC profile of sRGB's primaries with red and green exchanged (ICC.1:2001, matrix type)."""
 

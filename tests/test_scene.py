@@ -16,7 +16,7 @@ from roge_jax.data.images import Lens, ideal_K, undistort
 from roge_jax.data.readers import read_split
 from roge_jax.data.scene import Scene, load_scene, prepare, select_context
 from roge_jax.errors import UserError
-from roge_jax.geometry.cameras import Cameras, CameraWarning
+from roge_jax.geometry.cameras import Cameras, CameraWarning, validate
 from roge_jax.geometry.rays import directions, project
 
 CAMERAS = truth()
@@ -176,12 +176,138 @@ def test_lenses_that_cannot_be_read_are_refused(tmp_path):
         ({1: {"fl_x": "wide"}}, {}, r"frame 1 .*'fl_x' is 'wide': give a number"),
         ({2: {"fl_x": None}}, {}, r"frame 2 .*no focal length"),
         ({}, {"w": 500}, r"0000.png: is 40 x 24 pixels but its intrinsics are for 500 x 24"),
+        ({}, {"w": "wide"}, r"'w' is 'wide': give a whole number of at least 1"),
+        ({}, {"h": float("nan")}, r"'h' is nan: give a whole number"),
+        ({}, {"h": [24]}, r"'h' is \[24\]: give a whole number"),
+        ({}, {"w": 40.7}, r"'w' is 40.7: give a whole number"),
+        ({}, {"w": None}, r"has 'h' alone: give both"),
+        ({1: {"cx": True}}, {}, r"frame 1 .*'cx' is True: give a number"),
+        ({1: {"k1": float("nan")}}, {}, r"frame 1 .*'k1' is nan"),
+        ({}, {"k6": 0.1}, r"k6 = 0.1 with a PINHOLE camera"),
+        ({1: {"k1": 1e9}}, {}, r"0001.png: lens coefficients .* leave no usable picture"),
+        ({}, {"is_fisheye": True}, r"'is_fisheye' with camera_model PINHOLE"),
+        ({1: {"fl_x": None, "camera_angle_x": 50.0}}, {}, r"'camera_angle_x' is 50: .* radians"),
+        ({1: {"file_path": 3}}, {}, r"frame 1: has no 'file_path'"),
+        ({1: {"file_path": "/"}}, {}, r"photos are missing, first '/'"),
+        ({1: {"file_path": "a" * 5000}}, {}, r"1 of 4 photos are missing, first 'aaa"),
+        (
+            {1: {"transform_matrix": [[1, 0, 0, 1e300], *np.eye(4)[1:].tolist()]}},
+            {},
+            r"view 1 \(0001.png\), c2w: an entry is 1e\+300",
+        ),
     ],
 )
 def test_mistakes_in_transforms_are_named(tmp_path, change, top, message):
     files.nerfstudio(tmp_path, CAMERAS, change=change, **top)
     with pytest.raises(UserError, match=message):
         load_scene(tmp_path)
+
+
+def edited(content: bytes, new: bytes | tuple[bytes, bytes]) -> bytes:
+    return content.replace(*new) if isinstance(new, tuple) else new
+
+
+JUNK = b"\xff\xfe" * 40
+
+
+@pytest.mark.parametrize(
+    ("layout", "file", "new", "message"),
+    [
+        ("nerfstudio", "transforms.json", b"[" * 100000, "transforms.json: not valid JSON"),
+        ("nerfstudio", "transforms.json", JUNK, "it is no UTF-8 text"),
+        ("realestate10k", "abc.txt", JUNK, "abc.txt: cannot read"),
+        ("colmap text", "sparse/0/cameras.txt", JUNK, "cameras.txt: cannot read"),
+        ("colmap text", "sparse/0/cameras.txt", (b" 40 24 ", b" 0 0 "), "are 0 x 0 pixels"),
+        ("colmap text", "sparse/0/cameras.txt", (b" 40 24 ", b" inf 24 "), "line 2: expected"),
+        ("colmap binary", "sparse/0/cameras.bin", (b"\x28" + b"\0" * 7, b"\0" * 8), "are 0 x 24"),
+        ("lvsm", "metadata/abc.json", (b'"fxfycxcy": [', b'"fxfycxcy": [1, '), "give a list of 4"),
+        (
+            "lvsm",
+            "metadata/abc.json",
+            (b'"frames": [', b'"frames": [{"w2c": 1}, 3, '),
+            "frame 0: has no",
+        ),
+        ("cut3r re10k", "cam/900.npz", b"", "900.npz: damaged npz file"),
+        ("cut3r re10k", "cam/900.npz", b"PK\x03\x04cut", "900.npz: damaged npz file"),
+        ("vkitti", "extrinsic.txt", (b"\n0 0 ", b"\nx 0 "), "line 2: not all of it is numbers"),
+    ],
+)
+def test_damage_in_every_layout_is_named(tmp_path, layout, file, new, message):
+    path = LAYOUTS[layout](tmp_path)
+    (tmp_path / file).write_bytes(edited((tmp_path / file).read_bytes(), new))
+    with pytest.raises(UserError, match=message):
+        load_scene(path)
+
+
+def test_odd_but_clear_files_are_read(tmp_path):
+    """The mark of Windows editors and its line ends, names with dots, blanks and any letters, absolute ones."""
+    folder = files.nerfstudio(tmp_path, CAMERAS)
+    content = json.loads((folder / "transforms.json").read_text())
+    for entry, name in zip(
+        content["frames"], ("a.b c.png", "山.png", "d.e", str(folder / "f")), strict=True
+    ):
+        target = folder / (name if name.endswith(".png") else f"{name}.png")
+        (folder / entry["file_path"]).rename(target)
+        entry["file_path"] = name
+    text = json.dumps(content, indent=1).replace("\n", "\r\n")
+    (folder / "transforms.json").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    scene = load_scene(folder)
+    assert scene.names == ("a.b c.png", "山.png", "d.e.png", "f.png")
+    np.testing.assert_allclose(scene.images[3] * 255, picture(3), atol=1e-4)
+
+
+def test_cut3r_needs_matrices_and_cameras(tmp_path):
+    folder = files.cut3r(tmp_path, CAMERAS)
+    np.savez(folder / "cam" / "900.npz", intrinsics=np.eye(4), pose=np.eye(4))
+    with pytest.raises(
+        UserError, match=r"900.npz: 'intrinsics' is .* of shape \(4, 4\): give a 3x3"
+    ):
+        load_scene(folder)
+    for file in (folder / "cam").iterdir():
+        file.unlink()
+    with pytest.raises(UserError, match="there are no cameras"):
+        load_scene(folder)
+
+
+def test_frames_without_a_picture_are_told(tmp_path):
+    text = files.re10k(tmp_path, CAMERAS)
+    (tmp_path / "abc" / "900.png").unlink()
+    with pytest.warns(CameraWarning, match=r"1 of 4 frames have no picture"):
+        assert len(load_scene(text)) == 3
+
+
+@pytest.mark.parametrize("name", ["", "x" * 300, "procedural:²", "procedural:"])
+def test_names_that_are_no_scene(name):
+    with pytest.raises(UserError, match=r"There is no scene|whole number"):
+        load_scene(name)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((24, 40)), r"view 1 \(b\): the image is given as shape \(24, 40\): give an RGB"),
+        (np.zeros((24, 40, 4)), r"shape \(24, 40, 4\)"),
+        (np.zeros((3, 24, 40)), r"shape \(3, 24, 40\)"),
+        (np.zeros((0, 40, 3)), r"shape \(0, 40, 3\)"),
+        ([[1]], "given as list"),
+        (np.full((24, 40, 3), 200.0), "float64 values from 200 to 200: give uint8"),
+        (np.full((24, 40, 3), np.nan), "values from nan"),
+        (np.zeros((24, 40, 3), np.uint16), "uint16 values: give uint8"),
+    ],
+)
+def test_images_given_as_arrays_are_checked(image, message):
+    good = picture(0)
+    with pytest.raises(UserError, match=message):
+        prepare(Scene([good, image], CAMERAS[:2], ("a", "b"), "mine"), [0, 1], 16, 16)
+    with pytest.raises(UserError, match="1 images, 2 cameras and 2 names"):
+        prepare(Scene([good], CAMERAS[:2], ("a", "b"), "mine"), [0, 1], 16, 16)
+
+
+def test_hundreds_of_odd_views_are_a_few_warnings(recwarn):
+    cameras = looking_at_origin(200)
+    cameras.K[:, 0, 0] *= 100.0
+    Scene([picture(0)] * 200, validate(cameras, HEIGHT, WIDTH), ("a",) * 200, "mine")
+    assert len(recwarn) < 10 and "more like these" in str(recwarn[-1].message)
 
 
 def test_damaged_files_are_named(tmp_path):

@@ -7,6 +7,7 @@ import numpy as np
 
 from roge_jax.data.images import Frame, Lens
 from roge_jax.errors import UserError
+from roge_jax.fields import read_text
 from roge_jax.geometry.cameras import invert, rotation
 
 # Model name and number of parameters by COLMAP's id.
@@ -97,6 +98,16 @@ def make_camera(model: str, parameters: np.ndarray, width: int, height: int, whe
     return K, (int(height), int(width)), lens
 
 
+def _sized_camera(
+    model: str, parameters: np.ndarray, width: int, height: int, where: str
+) -> Camera:
+    if min(width, height) < 1:
+        raise UserError(
+            f"{where}: the camera's pictures are {width} x {height} pixels: both must be 1 or more."
+        )
+    return make_camera(model, parameters, width, height, where)
+
+
 def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
     cameras = {}
     for number, words in _lines(model / "cameras.txt"):
@@ -105,10 +116,9 @@ def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
             continue
         try:
             numbers = np.array([float(word) for word in words[2:]])
-            cameras[int(words[0])] = make_camera(
-                words[1], numbers[2:], int(numbers[0]), int(numbers[1]), where
-            )
-        except (ValueError, IndexError) as error:
+            width, height = int(numbers[0]), int(numbers[1])
+            cameras[int(words[0])] = _sized_camera(words[1], numbers[2:], width, height, where)
+        except (ValueError, IndexError, OverflowError) as error:
             raise (
                 error
                 if isinstance(error, UserError)
@@ -135,7 +145,7 @@ def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
 
 def _lines(file: Path) -> list[tuple[int, list[str]]]:
     """(number, words) of every line that is not a comment."""
-    text = file.read_text(encoding="utf-8").splitlines()
+    text = read_text(file, "scene file").splitlines()
     return [(i + 1, line.split()) for i, line in enumerate(text) if not line.startswith("#")]
 
 
@@ -148,7 +158,7 @@ def _read_bin(model: Path) -> tuple[dict[int, Camera], list]:
             camera_id, model_id, width, height = struct.unpack_from("<iiQQ", data, at)
             name, count = MODELS.get(model_id, (f"number {model_id}", 0))
             parameters = np.frombuffer(data, "<f8", count, at + 24)
-            cameras[camera_id] = make_camera(name, parameters, width, height, str(file))
+            cameras[camera_id] = _sized_camera(name, parameters, width, height, str(file))
             at += 24 + 8 * count
         file = model / "images.bin"
         data, at = file.read_bytes(), 8

@@ -4,8 +4,10 @@ Every picture comes out as float32 RGB [h, w, 3] in [0, 1], sRGB. What cannot be
 CMYK without a profile, damaged files) is refused with the file's name, never guessed.
 """
 
+import contextlib
 import dataclasses
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -67,17 +69,33 @@ def read_header(file: Path) -> Header:
             f"{file}: HDR pictures have no fixed white: tone-map it to an 8 or 16 bit PNG first."
         )
     try:
-        with Image.open(file) as picture:
+        with _opened(file) as picture:
             orientation = _orientation_tag(picture)
             bands = picture.getbands()
-            alpha = "A" in bands or "a" in bands or "transparency" in picture.info
             mode = picture.mode
+            transparent = mode != "LAB" and ("A" in bands or "a" in bands)
+            alpha = transparent or "transparency" in picture.info
             size = (picture.height, picture.width)
     except FileNotFoundError:
         raise UserError(f"{file}: there is no such picture.") from None
+    except Image.DecompressionBombError:
+        raise UserError(
+            f"{file}: has more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels: make it smaller."
+        ) from None
     except Exception as error:
         raise UserError(f"{file}: not a readable picture ({error}).") from None
     return Header(size, orientation if 1 <= orientation <= 8 else 1, alpha, mode)
+
+
+@contextlib.contextmanager
+def _opened(file: Path) -> Iterator[Any]:
+    """Pillow's picture. Large ones are fine: Pillow warns of them for the sake of web servers."""
+    from PIL import Image
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        with Image.open(file) as picture:
+            yield picture
 
 
 def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.ndarray:
@@ -89,14 +107,12 @@ def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.
       exif: turn the picture as its EXIF orientation says; False keeps the stored grid.
     Raises: UserError for missing, damaged, HDR, floating point or profile-less CMYK files.
     """
-    from PIL import Image
-
     header = read_header(file)
     try:
-        if _is_deep(file):
+        if header.mode not in ("CMYK", "LAB") and _is_deep(file):
             pixels = _read_deep(file)
         else:
-            with Image.open(file) as picture:
+            with _opened(file) as picture:
                 picture.load()
                 pixels = np.asarray(_to_rgb(picture, file), np.float32) / np.float32(255)
     except UserError:
@@ -158,7 +174,7 @@ def _to_rgb(picture: Any, file: Path) -> Any:
     profile = picture.info.get("icc_profile")
     if picture.mode == "CMYK" and not profile:
         raise UserError(f"{file}: CMYK without a colour profile: convert it to sRGB first.")
-    if picture.mode in ("F", "I", "I;16", "I;16B", "I;16L"):
+    if picture.mode in ("F", "I", "I;16", "I;16B", "I;16L", "LAB"):
         raise UserError(f"{file}: pixel mode {picture.mode}: convert it to an 8 or 16 bit PNG.")
     if profile and picture.mode in ("RGB", "CMYK"):
         try:

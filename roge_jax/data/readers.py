@@ -4,7 +4,8 @@ nerfstudio (`transforms.json`, also DL3DV and instant-ngp), COLMAP, RealEstate10
 pixelSplat / LVSM json, CUT3R's processed folders, ScanNet's export, Virtual KITTI 2.
 """
 
-import json
+import warnings
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,9 +14,12 @@ import numpy as np
 from roge_jax.data.colmap import find_model, make_camera, read_colmap
 from roge_jax.data.images import Frame, Lens
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.geometry.cameras import CONVENTIONS, invert, to_opencv
+from roge_jax.fields import is_file, matrix, number, read_json, read_text
+from roge_jax.geometry.cameras import CONVENTIONS, CameraWarning, invert, to_opencv
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".exr", ".hdr")
+SCENE = "scene file"
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LAYOUTS = (
     "transforms.json (nerfstudio, DL3DV)",
     "sparse/0/ + images/ (COLMAP)",
@@ -43,7 +47,7 @@ def read_frames(path: Path, *, convention: str | None = None, camera: int = 0) -
     if path.is_file():
         if path.suffix == ".txt":
             return read_re10k(path)
-        content = _json(path)
+        content = read_json(path, SCENE)
         frames = content.get("frames") if isinstance(content, dict) else None
         if frames and isinstance(frames[0], dict) and "w2c" in frames[0]:
             return read_lvsm(path)
@@ -76,19 +80,19 @@ def read_nerfstudio(file: Path, *, convention: str | None = None) -> list[Frame]
     Photos are matched by the name in `file_path`. A photo that lies in `images_2`, `images_4` or
     `images_8` instead is taken from there; K follows from the picture size.
     """
-    content = _json(file)
+    content = read_json(file, SCENE)
     entries = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{file}: has no frames: 'frames' must be a list with one entry per photo.")
     frames, missing = [], []
     for i, entry in enumerate(entries):
         where = f"{file}, frame {i}"
-        if not isinstance(entry, dict) or "file_path" not in entry:
+        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
             raise UserError(f"{where}: has no 'file_path': name the photo.")
         where = f"{where} ({entry['file_path']})"
-        picture = _find_picture(file.parent, str(entry["file_path"]))
+        picture = _find_picture(file.parent, entry["file_path"])
         if picture is None:
-            missing.append(str(entry["file_path"]))
+            missing.append(entry["file_path"])
             continue
         pose = _pose(entry.get("transform_matrix"), f"{where}: 'transform_matrix'")
         K, size, lens = _nerfstudio_camera({**content, **entry}, where, picture)
@@ -108,24 +112,24 @@ def _nerfstudio_camera(
     fields: dict, where: str, picture: Path
 ) -> tuple[np.ndarray, tuple[int, int] | None, Lens | None]:
     """K, the size it is for and the lens, from a frame's fields laid over the file's."""
-    size = (int(fields["h"]), int(fields["w"])) if "h" in fields and "w" in fields else None
-    if size is not None and min(size) < 1:
-        raise UserError(f"{where}: 'w' x 'h' is {size[1]} x {size[0]}: give the size in pixels.")
+    size = _size(fields, where)
     model = str(fields.get("camera_model", "OPENCV")).upper()
-    numbers = {}
-    for name in (
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "camera_angle_x",
-        *("k1", "k2", "k3", "k4", "p1", "p2"),
-    ):
-        try:
-            if fields.get(name) is not None:
-                numbers[name] = float(fields[name])
-        except (TypeError, ValueError):
-            raise UserError(f"{where}: '{name}' is {fields[name]!r}: give a number.") from None
+    if fields.get("is_fisheye"):  # instant-ngp's word for it
+        if model not in ("OPENCV_FISHEYE", "OPENCV"):
+            raise UserError(
+                f"{where}: 'is_fisheye' with camera_model {model}: give one of the two."
+            )
+        model = "OPENCV_FISHEYE"
+    numbers = {
+        name: number(fields[name], where, name)
+        for name in ("fl_x", "fl_y", "cx", "cy", "camera_angle_x", *DISTORTION)
+        if fields.get(name) is not None
+    }
+    for name in DISTORTION:
+        if not np.isfinite(numbers.get(name, 0.0)):
+            raise UserError(
+                f"{where}: '{name}' is {numbers[name]}: give a number, or leave it out."
+            )
     if "fl_x" not in numbers and "camera_angle_x" not in numbers:
         raise UserError(f"{where}: no focal length: give 'fl_x' (pixels) or 'camera_angle_x'.")
     if size is None and not {"fl_x", "cx", "cy"} <= set(numbers):
@@ -136,6 +140,12 @@ def _nerfstudio_camera(
         fx = numbers["fl_x"]
     else:
         assert size is not None
+        angle = numbers["camera_angle_x"]
+        if not 0 < angle < np.pi:
+            raise UserError(
+                f"{where}: 'camera_angle_x' is {angle:g}: give the full horizontal angle in radians, "
+                "between 0 and 3.14."
+            )
         fx = 0.5 * size[1] / np.tan(0.5 * numbers["camera_angle_x"])
     fy = numbers.get("fl_y", fx)
     cx = numbers["cx"] if "cx" in numbers else 0.5 * size[1]  # type: ignore[index]
@@ -144,9 +154,10 @@ def _nerfstudio_camera(
     if model == "OPENCV_FISHEYE":
         model, rest = "OPENCV_FISHEYE", [k1, k2, k3, k4]
     elif model in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"):
-        if k4:
+        more = [name for name in ("k4", "k5", "k6") if numbers.get(name)]
+        if more:
             raise UserError(
-                f"{where}: k4 = {k4} with a {model} camera: undistort the photos first."
+                f"{where}: {more[0]} = {numbers[more[0]]} with a {model} camera: undistort the photos first."
             )
         model, rest = "FULL_OPENCV", [k1, k2, p1, p2, k3, 0.0, 0.0, 0.0]
     else:
@@ -159,22 +170,38 @@ def _nerfstudio_camera(
     return K, size, lens
 
 
+def _size(fields: dict, where: str) -> tuple[int, int] | None:
+    """(height, width) that the intrinsics are for, if the file says."""
+    given = [name for name in ("h", "w") if fields.get(name) is not None]
+    if len(given) == 1:
+        raise UserError(
+            f"{where}: has '{given[0]}' alone: give both 'w' and 'h' (pixels), or neither."
+        )
+    if not given:
+        return None
+    height, width = (number(fields[name], where, name, low=1, whole=True) for name in given)
+    return height, width
+
+
 def _find_picture(folder: Path, name: str) -> Path | None:
     """The photo called `name` in `folder`, in its downsampled siblings, or with an ending added."""
     given = Path(name)
+    if not given.name:
+        return None
     places = [folder / given]
     if given.parent.name.startswith("images") or not given.parent.name:
         folders = ("images", "images_2", "images_4", "images_8")
         places += [folder / given.parent.parent / other / given.name for other in folders]
     for place in places:
-        if place.is_file():
+        if is_file(place):
             return place
-        for ending in PICTURES:
-            if not place.suffix and place.with_suffix(ending).is_file():
-                return place.with_suffix(ending)
+        for ending in PICTURES:  # the name may have dots of its own
+            added = place.with_name(place.name + ending)
+            if place.suffix.lower() not in PICTURES and is_file(added):
+                return added
     for place in places[1:]:  # DL3DV: the same name as .png where the json says .jpg
         for ending in PICTURES:
-            if place.with_suffix(ending).is_file():
+            if is_file(place.with_suffix(ending)):
                 return place.with_suffix(ending)
     return None
 
@@ -188,16 +215,16 @@ def read_re10k(file: Path) -> list[Frame]:
     candidates = [file.with_suffix(""), file.parent / "frames" / file.stem, file.parent / "frames"]
     candidates += [file.parent.parent / "frames" / file.stem, file.parent]
     frames, missing = [], []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+    for row, line in enumerate(read_text(file, SCENE).splitlines(), 1):
         words = line.split()
         if len(words) != 19:
-            if number == 1 or not words:
+            if row == 1 or not words:
                 continue  # the address of the video
-            raise UserError(f"{file}, line {number}: has {len(words)} numbers, expected 19.")
+            raise UserError(f"{file}, line {row}: has {len(words)} numbers, expected 19.")
         try:
             numbers = np.array([float(word) for word in words[1:]])
         except ValueError:
-            raise UserError(f"{file}, line {number}: not all of it is numbers.") from None
+            raise UserError(f"{file}, line {row}: not all of it is numbers.") from None
         names = [f"{words[0]}{ending}" for ending in PICTURES]
         places = (folder / name for folder in candidates for name in names)
         picture = next((place for place in places if place.is_file()), None)
@@ -211,24 +238,29 @@ def read_re10k(file: Path) -> list[Frame]:
     if not frames:
         looked = ", ".join(dict.fromkeys(str(folder) for folder in candidates))
         raise UserError(f"{file}: found none of its {len(missing)} frames in {looked}.")
+    if missing:
+        message = f"{file}: {len(missing)} of {len(frames) + len(missing)} frames have no picture and are left out."
+        warnings.warn(message, CameraWarning, stacklevel=2)
     return frames
 
 
 def read_lvsm(file: Path) -> list[Frame]:
     """pixelSplat / LVSM metadata: frames with `image_path`, `fxfycxcy` (pixels) and `w2c`."""
     frames = []
-    for i, entry in enumerate(_json(file)["frames"]):
+    for i, entry in enumerate(read_json(file, SCENE)["frames"]):
         where = f"{file}, frame {i}"
+        if not isinstance(entry, dict):
+            raise UserError(f"{where}: is no object with 'image_path', 'fxfycxcy' and 'w2c'.")
         for field in ("fxfycxcy", "w2c"):
             if field not in entry:
                 raise UserError(f"{where}: has no '{field}'.")
         name = Path(str(entry.get("image_path", f"{i:05d}.png")))
         folder = file.parent.parent / "images" / file.stem
         places = (folder / name.name, file.parent / name, name)
-        picture = next((place for place in places if place.is_file()), None)
+        picture = next((place for place in places if is_file(place)), None)
         if picture is None:
             raise UserError(f"{where}: photo {places[0]} is missing.")
-        fx, fy, cx, cy = (float(number) for number in entry["fxfycxcy"])
+        fx, fy, cx, cy = matrix(entry["fxfycxcy"], (4,), where, "fxfycxcy")
         K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         frames.append(Frame(picture, K, invert(_pose(entry["w2c"], f"{where}: 'w2c'"))))
     return frames
@@ -251,18 +283,28 @@ def read_cut3r(folder: Path) -> list[Frame]:
         if picture is None:
             raise UserError(f"{file}: its photo {parent / stem} is missing.")
         try:
-            with np.load(file) as content:
+            with (
+                file.open("rb") as stream,
+                zipfile.ZipFile(stream),
+            ):  # np.load also takes other files
+                content = np.load(file)
+            with content:
                 fields = {name: content[name] for name in content.files}
-        except (OSError, ValueError) as error:
-            raise UserError(f"{file}: damaged npz file ({error}).") from None
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise UserError(f"{file}: damaged npz file ({error}): copy it again.") from None
         K = next(
             (fields[n] for n in ("intrinsics", "intrinsic", "camera_intrinsics") if n in fields),
             None,
         )
         pose = next((fields[n] for n in ("pose", "camera_pose") if n in fields), None)
         if K is None or pose is None:
-            raise UserError(f"{file}: needs 'intrinsics' and 'pose', has {', '.join(fields)}.")
-        frames.append(Frame(picture, np.asarray(K, np.float64), _pose(pose, f"{file}: 'pose'")))
+            raise UserError(
+                f"{file}: needs 'intrinsics' and 'pose', has {', '.join(fields) or 'nothing'}."
+            )
+        K = matrix(K, (3, 3), str(file), "intrinsics")
+        frames.append(Frame(picture, K, _pose(pose, f"{file}: 'pose'")))
+    if not frames:
+        raise UserError(f"{folder}: there are no cameras: need cam/NAME.npz for rgb/NAME.png.")
     return frames
 
 
@@ -293,7 +335,10 @@ def read_vkitti(folder: Path, camera: int = 0) -> list[Frame]:
     intrinsics = dict(_vkitti_rows(folder / "intrinsic.txt", camera, 4))
     frames = []
     for picture in _pictures(folder / "frames" / "rgb" / f"Camera_{camera}"):
-        index = int(picture.stem.removeprefix("rgb_"))
+        digits = picture.stem.removeprefix("rgb_")
+        if not digits.isdecimal():
+            raise UserError(f"{picture}: is not named rgb_NUMBER: move it out of this folder.")
+        index = int(digits)
         if index not in poses or index not in intrinsics:
             raise UserError(f"{picture}: frame {index} of camera {camera} has no row of numbers.")
         fx, fy, cx, cy = intrinsics[index]
@@ -307,38 +352,36 @@ def read_vkitti(folder: Path, camera: int = 0) -> list[Frame]:
 def read_split(folder: Path, context: int) -> tuple[list[int], list[int]]:
     """SEVA's `train_test_split_<M>.json`: (context, target) indices into the photos by name."""
     file = folder / f"train_test_split_{context}.json"
-    content = _json(file)
-    if not {"train_ids", "test_ids"} <= set(content):
-        raise UserError(f"{file}: needs 'train_ids' and 'test_ids', has {', '.join(content)}.")
-    return list(content["train_ids"]), list(content["test_ids"])
+    content = read_json(file)
+    if not isinstance(content, dict) or not {"train_ids", "test_ids"} <= set(content):
+        raise UserError(f"{file}: needs an object with 'train_ids' and 'test_ids'.")
+    found = []
+    for name in ("train_ids", "test_ids"):
+        if not isinstance(content[name], list):
+            raise UserError(f"{file}: '{name}' is {content[name]!r}: give a list of photo numbers.")
+        found.append([number(i, str(file), name, low=0, whole=True) for i in content[name]])
+    return found[0], found[1]
 
 
 def _vkitti_rows(file: Path, camera: int, count: int) -> Iterator[tuple[int, np.ndarray]]:
-    for number, line in enumerate(_text(file).splitlines()[1:], 2):
+    for line_number, line in enumerate(read_text(file, SCENE).splitlines()[1:], 2):
         words = line.split()
         if words and len(words) != 2 + count:
-            raise UserError(f"{file}, line {number}: has {len(words)} numbers, not {2 + count}.")
-        if words and int(words[1]) == camera:
-            yield int(words[0]), np.array([float(word) for word in words[2:]])
-
-
-def _json(file: Path):
-    try:
-        return json.loads(_text(file))
-    except json.JSONDecodeError as error:
-        raise UserError(f"{file}: not valid JSON ({error}).") from None
-
-
-def _text(file: Path) -> str:
-    try:
-        return file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{file}: cannot be read ({error}).") from None
+            raise UserError(
+                f"{file}, line {line_number}: has {len(words)} numbers, not {2 + count}."
+            )
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            raise UserError(f"{file}, line {line_number}: not all of it is numbers.") from None
+        if words and numbers[1] == camera:
+            yield int(numbers[0]), np.array(numbers[2:])
 
 
 def _numbers(file: Path, count: int) -> np.ndarray:
+    text = read_text(file, SCENE)
     try:
-        numbers = np.array([float(word) for word in _text(file).split()])
+        numbers = np.array([float(word) for word in text.split()])
     except ValueError:
         raise UserError(f"{file}: not all of it is numbers.") from None
     if numbers.size != count:

@@ -19,6 +19,7 @@ from roge_jax.data.images import (
 )
 from roge_jax.data.readers import read_frames
 from roge_jax.errors import UserError, did_you_mean
+from roge_jax.fields import number
 from roge_jax.geometry.cameras import (
     Cameras,
     CameraWarning,
@@ -105,13 +106,22 @@ def open_scene(
         return _motorcycle()
     if name.startswith("procedural:"):
         return _procedural(name, frames, height, width, supersample)
-    if not Path(spec).exists() and "/" not in name and "." not in name:
-        hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
-        raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
     if exif not in ("auto", "ignore"):
         raise UserError(f"exif='{exif}': {did_you_mean(exif, ('auto', 'ignore'))}")
+    if not 0 <= background <= 1:
+        raise UserError(f"background={background}: give a grey from 0 (black) to 1 (white).")
+    if not name or (not _exists(Path(spec)) and "/" not in name and "." not in name):
+        hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
+        raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
     found = read_frames(Path(spec), convention=convention, camera=camera)
     return _assemble(found, name, exif, background)
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # a name that no file can have
+        return False
 
 
 def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:
@@ -129,7 +139,7 @@ def _assemble(frames: list[Frame], source: str, exif: str, background: float) ->
         K, pose = _fit_K(frame, size), frame.c2w
         photo = Photo(frame.file, size, use_tag, turns, background=background)
         if frame.lens is not None and np.isfinite(K).all():
-            new_K = ideal_K(K, frame.lens, size)
+            new_K = _straightened_K(K, frame, size)
             photo = dataclasses.replace(photo, lens=frame.lens, K=K, new_K=new_K)
             K = new_K
             note("note", f"photos have {frame.lens.model} lens distortion", "it is removed")
@@ -150,6 +160,18 @@ def _assemble(frames: list[Frame], source: str, exif: str, background: float) ->
     names = tuple(frame.file.name for frame in frames)
     cameras = Cameras(np.stack(Ks), np.stack(poses))
     return Scene(Photos(photos), cameras, names, source, notes=tuple(notes.values()))
+
+
+def _straightened_K(K: np.ndarray, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    assert frame.lens is not None
+    new_K = ideal_K(K, frame.lens, size)
+    zoom = new_K[[0, 1], [0, 1]] / np.maximum(np.abs(K[[0, 1], [0, 1]]), 1e-300)
+    if not (np.isfinite(new_K).all() and (zoom > 0.02).all() and (zoom < 50).all()):
+        raise UserError(
+            f"{frame.file}: lens coefficients {frame.lens.coefficients} leave no usable picture (the focal length "
+            f"would change by a factor of {zoom[0]:.3g}): check them."
+        )
+    return new_K
 
 
 def _orientation(header: Header, frame: Frame, exif: str) -> tuple[bool, int]:
@@ -212,13 +234,18 @@ def _motorcycle() -> Scene:
     return Scene(images, cameras, ("left", "right"), "motorcycle", depths=[depth, unknown])
 
 
+def procedural_seed(name: str) -> int:
+    """The seed of "procedural:SEED"."""
+    digits = name.removeprefix("procedural:")
+    if not digits.removeprefix("-").isdecimal():
+        raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.")
+    return int(digits)
+
+
 def _procedural(name: str, frames: int, height: int, width: int, supersample: int) -> Scene:
     from roge_jax.data import procedural
 
-    try:
-        seed = int(name.removeprefix("procedural:"))
-    except ValueError:
-        raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.") from None
+    seed = procedural_seed(name)
     made = procedural.sample_sequence(
         seed, frames=frames, height=height, width=width, supersample=supersample
     )
@@ -243,12 +270,20 @@ def prepare(
     Raises: UserError for views that do not exist, and for photos whose aspect ratios differ by more
       than a factor of two (one crop would show what the other lacks).
     """
-    ids = [int(i) for i in ids]
+    ids = [number(i, scene.source, "view", whole=True) for i in ids]
+    if not len(scene.images) == len(scene.cameras) == len(scene):
+        raise UserError(
+            f"{scene.source}: {len(scene.images)} images, {len(scene.cameras)} cameras and {len(scene)} names: "
+            "give one of each per view."
+        )
     for i in ids:
         if not 0 <= i < len(scene):
             raise UserError(f"{scene.source}: there is no view {i}: it has {len(scene)}, from 0.")
     if not ids:
         raise UserError(f"{scene.source}: no views were chosen: give at least one.")
+    if not isinstance(scene.images, Photos):
+        for i in ids:
+            _check_pixels(scene.images[i], f"{scene.source}, view {i} ({scene.names[i]})")
     aspects = [scene.sizes[i][1] / scene.sizes[i][0] for i in ids]
     if max(aspects) > 2 * min(aspects):
         wide, tall = ids[int(np.argmax(aspects))], ids[int(np.argmin(aspects))]
@@ -270,6 +305,22 @@ def prepare(
             warnings.warn(message, CameraWarning, stacklevel=2)
             pictures, cameras = pictures[kept], cameras[kept]
     return pictures, cameras
+
+
+def _check_pixels(image: Any, where: str) -> None:
+    """Raise UserError unless an image given as an array is [h, w, 3], uint8 or float in [0, 1]."""
+    shape, dtype = getattr(image, "shape", None), np.dtype(getattr(image, "dtype", object))
+    if shape is None or len(shape) != 3 or shape[-1] != 3 or 0 in shape:
+        given = type(image).__name__ if shape is None else f"shape {tuple(shape)}"
+        raise UserError(f"{where}: the image is given as {given}: give an RGB array [h, w, 3].")
+    if dtype == np.uint8:
+        return
+    low, high = (float(np.min(image)), float(np.max(image))) if dtype.kind == "f" else (0.0, np.inf)
+    if not (low >= -1e-3 and high <= 1.001):  # NaN fails too
+        span = f" from {low:.4g} to {high:.4g}" if dtype.kind == "f" else ""
+        raise UserError(
+            f"{where}: the image has {dtype} values{span}: give uint8, or floats from 0 to 1."
+        )
 
 
 def distinct_views(images: Sequence[np.ndarray] | np.ndarray, cameras: Cameras) -> list[int]:
@@ -301,7 +352,10 @@ def select_context(
     """
     cameras = to_host(scene.cameras if isinstance(scene, Scene) else scene)
     pool = list(range(len(cameras))) if among is None else [int(i) for i in among]
-    if not 1 <= m <= len(pool):
+    for i in pool:
+        if not 0 <= i < len(cameras):
+            raise UserError(f"Cannot choose among view {i}: there are {len(cameras)}, from 0.")
+    if not isinstance(m, int | np.integer) or not 1 <= m <= len(pool):
         raise UserError(f"Cannot choose {m} context views: the scene offers 1 to {len(pool)}.")
     if first is not None and first not in pool:
         raise UserError(f"View {first} cannot be the first context: it is not among the choices.")

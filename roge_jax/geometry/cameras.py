@@ -49,6 +49,7 @@ __all__ = [
 ]
 
 CONVENTIONS = ("opencv", "opencv_w2c", "opengl", "opengl_w2c")
+MOST_WARNINGS = 5  # of one scene
 RULES = {"lagernvs": 1.35, "paper": 1.0}
 _FLIP = np.array([1.0, -1.0, -1.0, 1.0])  # OpenGL and OpenCV axes differ by the signs of y and z
 
@@ -376,6 +377,9 @@ def validate(
     if errors:
         more = f" {len(errors) - 1} more: run python -m roge_jax.check." if len(errors) > 1 else ""
         raise UserError(f"{errors[0]}{more}")
-    for finding in findings:
+    for finding in findings[:MOST_WARNINGS]:
         warnings.warn(str(finding), CameraWarning, stacklevel=2)
+    if len(findings) > MOST_WARNINGS:
+        more = f"{len(findings) - MOST_WARNINGS} more like these: run python -m roge_jax.check."
+        warnings.warn(more, CameraWarning, stacklevel=2)
     return cameras

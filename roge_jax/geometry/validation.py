@@ -13,6 +13,7 @@ FOCAL_RANGE = (
     0.05,
     50.0,
 )  # focal length / image width: fields of view from 168 down to 1.1 degrees
+FARTHEST = 1e100  # squares of positions must not overflow
 WIDE_FOV = 120.0  # degrees
 
 
@@ -47,6 +48,9 @@ def inspect_pose(pose: np.ndarray, where: str) -> tuple[np.ndarray, list[Finding
         row, column = np.argwhere(~np.isfinite(pose))[0]
         what = f"entry [{row}, {column}] is {pose[row, column]}"
         return pose, [found("error", what, "remove or fix this view")]
+    if np.abs(pose).max() > FARTHEST:
+        what = f"an entry is {pose.flat[np.abs(pose).argmax()]:.3g}"
+        return pose, [found("error", what, "no position is that far away, correct it")]
     if pose.shape == (3, 4):
         pose = np.concatenate([pose, [[0.0, 0.0, 0.0, 1.0]]])
     if not np.allclose(pose[3], [0, 0, 0, 1], rtol=0, atol=1e-6):
@@ -144,6 +148,15 @@ def inspect_arrays(
     if len(K) != len(c2w):
         what = f"{len(K)} intrinsics for {len(c2w)} poses"
         return K, c2w, [Finding("error", "cameras", what, "give one K per view")]
+    if K.ndim != 3 or c2w.ndim != 3 or K.dtype.kind not in "iuf" or c2w.dtype.kind not in "iuf":
+        what = f"K is {K.dtype} {K.shape} and c2w {c2w.dtype} {c2w.shape}"
+        fix = "give numbers, K [views, 3, 3] and c2w [views, 4, 4]"
+        return K, c2w, [Finding("error", "cameras", what, fix)]
+    if len(names) != len(c2w) or any(np.size(n) not in (1, len(c2w)) for n in (height, width)):
+        what = (
+            f"{len(names)} names or {np.size(height)} x {np.size(width)} sizes for {len(c2w)} poses"
+        )
+        return K, c2w, [Finding("error", "cameras", what, "give one per view")]
     heights = np.broadcast_to(np.asarray(height), (len(c2w),))
     widths = np.broadcast_to(np.asarray(width), (len(c2w),))
     poses, findings = [], []
