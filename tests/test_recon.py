@@ -449,6 +449,14 @@ def moved(c2w, seed=5):
     return motion[1][None] @ c2w
 
 
+def test_cameras_may_be_numpy_arrays():
+    K, c2w = (np.asarray(x) for x in cameras(3, SIZE, 5))
+    options = {"grid": (4, 6), "specials": 2, "head_dim": 16}
+    found = relative_cameras(K, c2w, SIZE, **options)
+    expected = relative_cameras(jnp.asarray(K), jnp.asarray(c2w), SIZE, **options)
+    jax.tree.map(np.testing.assert_array_equal, found, expected)
+
+
 @pytest.mark.parametrize("attention", ["bidirectional", "cross"])
 def test_relative_cameras_do_not_see_a_rigid_motion_of_the_ray_query(attention):
     """The ray maps are held fixed (they are absolute); what is left depends on relative cameras only."""

@@ -29,6 +29,7 @@ def relative_cameras(
 
     The tokens of a view are `specials` position-free ones, then a row-major `grid`.
     """
+    K, c2w = jnp.asarray(K), jnp.asarray(c2w)
     height, width = size
     v = K.shape[0]
     fx, fy = K[:, 0, 0] / width, K[:, 1, 1] / height
@@ -58,7 +59,6 @@ def relative_cameras(
         ],
         -1,
     )
-    c2w = jnp.asarray(c2w)
     rotation, origin = c2w[:, :3, :3], c2w[:, :3, 3]
     back = jnp.swapaxes(rotation, 1, 2)
     w2c = c2w.at[:, :3, :3].set(back).at[:, :3, 3].set(-jnp.einsum("vij,vj->vi", back, origin))
