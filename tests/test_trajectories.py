@@ -8,7 +8,13 @@ from camera_cases import looking_at_origin, moved, random_cameras, random_rigid,
 from hypothesis import given, settings
 
 from roge_jax.errors import UserError
-from roge_jax.geometry.cameras import CONVENTIONS, Cameras, opencv_to_opengl, relative_to
+from roge_jax.geometry.cameras import (
+    CONVENTIONS,
+    Cameras,
+    normalise,
+    opencv_to_opengl,
+    relative_to,
+)
 from roge_jax.geometry.paths import interpolate
 from roge_jax.geometry.rays import project
 from roge_jax.geometry.trajectories import (
@@ -240,6 +246,52 @@ def test_mistakes_are_named():
         make_path("orbit", CONTEXT, 0)
 
 
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("orbit", {"degrees": "wide"}, "'degrees' is 'wide': give a number"),
+        ("orbit", {"degrees": float("nan")}, "'degrees' is nan: give a number from"),
+        ("orbit", {"degrees": None}, "'degrees' is None"),
+        ("orbit", {"swing": "maybe"}, "'swing' is 'maybe': give true or false"),
+        ("orbit", {"ease": "no"}, "'ease' is 'no': give true or false"),
+        ("orbit", {"focus": "far"}, "'focus' is 'far': give a number"),
+        ("orbit", {"focus": 1e300}, "focus=1e\\+300 is no distance"),
+        ("orbit", {"start": 0.5}, "'start' is 0.5: give a whole number"),
+        ("orbit", {"frames": 2.5}, "'frames' is 2.5: give a whole number"),
+        ("spiral", {"radius": [1]}, "'radius' is \\[1\\]: give a number"),
+        ("dolly-in", {"distance": 1e9}, "give a number from -1e\\+06 to 1e\\+06"),
+        ("zoom-in", {"factor": 0}, "factor=0 is no zoom"),
+        ("zoom-out", {"factor": 0}, "factor=0 is no zoom"),
+        ("zoom-out", {"factor": -1}, "is no zoom: give 0.01 to 100"),
+        ("interpolate", {"order": 3}, "order='3'"),
+        (["orbit"], {}, "There is no trajectory"),
+        ("ORBIT", {}, "did you mean 'orbit'"),
+    ],
+)
+def test_options_of_the_wrong_kind_are_named(name, options, message):
+    with pytest.raises(UserError, match=message):
+        make_path(name, CONTEXT, **({"frames": 5} | options))
+
+
+@pytest.mark.parametrize(
+    ("cameras", "message"),
+    [
+        ("motorcycle", "context cameras are given as str: give roge_jax.Cameras"),
+        (Cameras(np.eye(3), np.eye(4)), r"K of shape \(3, 3\)"),
+        (Cameras(CONTEXT.K[:1], CONTEXT.c2w), r"K of shape \(1, 3, 3\) and c2w of shape"),
+        (Cameras(CONTEXT.K, CONTEXT.c2w[:, :3]), r"c2w of shape \(., 3, 4\)"),
+        (Cameras(CONTEXT.K, CONTEXT.c2w * np.nan), "context view 0 has NaN"),
+        (Cameras([["a"]], CONTEXT.c2w), "no arrays of numbers"),
+        (CONTEXT[[]], "no context views"),
+    ],
+)
+def test_cameras_given_as_arrays_are_checked(cameras, message):
+    with pytest.raises(UserError, match=message):
+        make_path("orbit", cameras, 5)
+    with pytest.raises(UserError, match=message):
+        normalise(cameras, CONTEXT)
+
+
 @pytest.mark.parametrize("convention", CONVENTIONS)
 def test_path_file_round_trip(tmp_path, convention):
     path = random_cameras(np.random.default_rng(0), 4)
@@ -264,6 +316,13 @@ def test_key_frames_are_interpolated(tmp_path):
     path = load_path(write(tmp_path, content), frames=9)
     np.testing.assert_allclose(path.c2w[::2], CONTEXT.c2w, atol=1e-9)
     np.testing.assert_allclose(path.K[:, 1, 1], 12 / np.tan(np.radians(30)))
+    for count in ("many", -1, 2.5):
+        with pytest.raises(UserError, match=f"'count' is .*{count}.*: give a whole number"):
+            load_path(write(tmp_path, content | {"count": count}))
+    keys[1]["time"] = "soon"
+    with pytest.raises(UserError, match="frame 1: 'time' is 'soon': give a number"):
+        load_path(write(tmp_path, content))
+    keys[1]["time"] = 2.0
     keys[2]["time"] = 0.5
     with pytest.raises(UserError, match="increasing"):
         load_path(write(tmp_path, content))
@@ -296,6 +355,22 @@ def test_nerfstudio_paths(tmp_path):
         ({"frames": [{"pose": np.diag([1.0, 1, -1, 1]).tolist()}]}, "mirrored"),
         ({"fov": 190.0}, "fov 190"),
         ({"fov": None}, "no intrinsics"),
+        ({"fov": "wide"}, "frame 0: 'fov' is 'wide': give a number"),
+        ({"fov": None, "K": "wide"}, "frame 0: 'K' is 'wide': give a 3x3 matrix"),
+        ({"fov": None, "K": [[1, 2, 3], [4]]}, "frame 0: 'K' is .*: give a 3x3 matrix"),
+        ({"fov": None, "K": [[float("nan")] * 3] * 3}, r"K: entry \[0, 0\] is nan"),
+        ({"fov": None, "fl_x": [1]}, r"'fl_x' is \[1\]: give a number"),
+        ({"fov": None, "fl_x": 40, "cx": "middle"}, "'cx' is 'middle': give a number"),
+        ({"fov": None, "fl_y": 40}, "has 'fl_y' alone"),
+        ({"fov": None, "camera_angle_x": 50}, "0 to 3.14 radians"),
+        ({"width": float("nan")}, "'width' is nan: give a whole number of at least 1"),
+        ({"height": -24}, "'height' is -24: give a whole number"),
+        ({"width": None}, "has 'height' alone"),
+        ({"frames": [3]}, "frame 0: is no object with 'pose'"),
+        ({"frames": [{"pose": np.eye(4).tolist()}, None]}, "frame 1: is no object"),
+        ({"camera_path": [3]}, "frame 0: is no object with 'camera_to_world'"),
+        ({"keyframes": [{"pose": np.eye(4).tolist()}]}, "both 'frames' and 'keyframes'"),
+        ({"frames": [{"pose": [[1, 0, 0, 1e300], *np.eye(4)[1:].tolist()]}]}, "1e\\+300"),
     ],
 )
 def test_path_file_mistakes(tmp_path, change, message):
@@ -311,9 +386,13 @@ def test_path_files_are_not_resampled(tmp_path):
         load_path(write(tmp_path, content | SIZE), frames=5)
     with pytest.raises(UserError, match="needs the picture size"):
         load_path(write(tmp_path, content))
-    with pytest.raises(UserError, match="not a JSON file"):
-        (tmp_path / "p.json").write_text("{")
-        load_path(tmp_path / "p.json")
+    for damage in (b"{", b"[" * 100000):
+        (tmp_path / "p.json").write_bytes(damage)
+        with pytest.raises(UserError, match="not valid JSON"):
+            load_path(tmp_path / "p.json")
+    marked = json.dumps(content | SIZE).replace(", ", ",\r\n").encode("utf-8-sig")
+    (tmp_path / "p.json").write_bytes(marked)
+    assert len(load_path(tmp_path / "p.json")) == 3
     with pytest.raises(UserError, match="cannot read"):
         load_path(tmp_path / "none.json")
 

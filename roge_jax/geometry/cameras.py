@@ -17,8 +17,9 @@ import numpy as np
 from flax import struct
 
 from roge_jax.errors import UserError, did_you_mean
+from roge_jax.fields import number
 from roge_jax.geometry.crops import crop_resize, crop_resize_K, resize, scale_K, shift_K, turn
-from roge_jax.geometry.validation import Finding, inspect_arrays
+from roge_jax.geometry.validation import FARTHEST, Finding, inspect_arrays
 
 __all__ = [
     "CONVENTIONS",
@@ -76,7 +77,7 @@ class Cameras:
         if isinstance(index, (int, np.integer)):
             index = [int(index)]
         elif not isinstance(index, slice):
-            index = np.asarray(index)
+            index = np.asarray(index) if len(index) else slice(0)
         return Cameras(self.K[index], self.c2w[index])
 
     @property
@@ -88,6 +89,35 @@ class Cameras:
 def to_host(cameras: Cameras) -> Cameras:
     """The same cameras as float64 NumPy."""
     return Cameras(np.asarray(cameras.K, np.float64), np.asarray(cameras.c2w, np.float64))
+
+
+def checked_views(cameras: Cameras, name: str) -> Cameras:
+    """`to_host` of cameras [v]. Raises UserError unless there is one finite K and c2w for each of one or more views."""
+    if not isinstance(cameras, Cameras):
+        raise UserError(
+            f"The {name} cameras are given as {type(cameras).__name__}: give roge_jax.Cameras(K, c2w)."
+        )
+    try:
+        cameras = to_host(cameras)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"The {name} cameras are no arrays of numbers ({error}).") from None
+    K, c2w = cameras.K.shape, cameras.c2w.shape
+    if len(K) != 3 or len(c2w) != 3 or K[1:] != (3, 3) or c2w[1:] != (4, 4) or K[0] != c2w[0]:
+        raise UserError(
+            f"The {name} cameras have K of shape {K} and c2w of shape {c2w}: give [views, 3, 3] and [views, 4, 4]."
+        )
+    if not len(cameras):
+        raise UserError(f"There are no {name} views: give at least one {name} camera.")
+    bad = ~np.isfinite(cameras.c2w).all((1, 2)) | ~np.isfinite(cameras.K).all((1, 2))
+    if bad.any():
+        view = int(np.argmax(bad))
+        raise UserError(f"{name} view {view} has NaN or infinite numbers in K or c2w: fix it.")
+    if np.abs(cameras.c2w).max() > FARTHEST:
+        view = int(np.argmax(np.abs(cameras.c2w).max((1, 2))))
+        raise UserError(
+            f"{name} view {view} is {np.abs(cameras.c2w[view]).max():.3g} away: fix its c2w."
+        )
+    return cameras
 
 
 def concatenate(*cameras: Cameras) -> Cameras:
@@ -266,21 +296,14 @@ def normalise(
     Whether centres coincide is decided relative to the targets' reach and to the rounding of the
     input, so the result does not depend on the scene's unit.
     """
-    context, target = to_host(context), to_host(target)
-    for name, cameras in (("context", context), ("target", target)):
-        if len(cameras) == 0:
-            raise UserError(f"There are no {name} views: give at least one {name} camera.")
-        if not (np.isfinite(cameras.c2w).all() and np.isfinite(cameras.K).all()):
-            sums = cameras.c2w.sum((1, 2)) + cameras.K.sum((1, 2))
-            view = int(np.argmin(np.isfinite(sums)))
-            raise UserError(f"{name} view {view} has NaN or infinite numbers in K or c2w: fix it.")
+    context, target = checked_views(context, "context"), checked_views(target, "target")
     if rule not in RULES:
         raise UserError(f"Unknown scale rule '{rule}': {did_you_mean(rule, RULES)}")
     if degenerate not in ("targets", "one"):
         raise UserError(
             f"degenerate='{degenerate}' is unknown: {did_you_mean(degenerate, ('targets', 'one'))}"
         )
-    if scale is not None and not (np.isfinite(scale) and scale > 0):
+    if scale is not None and not 0 < number(scale, "The scene", "scale") < np.inf:
         raise UserError(
             f"The scene scale {scale} cannot be a divisor: give a positive number in scene units."
         )

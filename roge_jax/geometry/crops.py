@@ -53,8 +53,10 @@ def crop_resize(image: np.ndarray, K: Any, height: int, width: int) -> tuple[np.
       K: [..., 3, 3] in pixels of `image`.
     Returns: float32 [height, width, c] in [0, 1], and K in pixels of that picture.
     """
-    if height < 1 or width < 1:
-        raise UserError(f"Cannot resize to {width} x {height} pixels: both must be 1 or more.")
+    if not all(isinstance(side, int | np.integer) and side >= 1 for side in (height, width)):
+        raise UserError(
+            f"Cannot resize to {width} x {height} pixels: both must be whole numbers, 1 or more."
+        )
     source = (image.shape[0], image.shape[1])
     top, left, keep_height, keep_width = cover_window(source, (height, width))
     window = image[top : top + keep_height, left : left + keep_width]

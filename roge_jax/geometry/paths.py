@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from roge_jax.errors import UserError, did_you_mean
+from roge_jax.fields import matrix, number, read_json
 from roge_jax.geometry.cameras import (
     CONVENTIONS,
     Cameras,
@@ -121,18 +122,15 @@ def load_path(
     Raises: UserError naming the file, the frame and the field.
     """
     file = Path(file)
-    try:
-        content = json.loads(file.read_text())
-    except OSError as error:
-        raise UserError(f"{file}: cannot read the path file ({error.strerror}).") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise UserError(f"{file}: not a JSON file ({error}).") from None
+    if frames is not None:
+        frames = number(frames, str(file), "frames", low=1, whole=True)
+    content = read_json(file, "path file")
     if not isinstance(content, dict):
         raise UserError(f"{file}: expected an object with 'convention' and 'frames'.")
     entries, field, convention = _entries(content, file)
     matrices = [_matrix(entry, field, f"{file}, frame {i}") for i, entry in enumerate(entries)]
     poses = to_opencv(np.stack(matrices), convention)
-    size = _size(content)
+    size = _size(content, str(file))
     target = (height, width) if height and width else size
     K = [
         _intrinsics(entry, content, size, target, context, f"{file}, frame {i}")
@@ -140,11 +138,14 @@ def load_path(
     ]
     cameras = Cameras(np.stack(K), poses)
     names = [f"{file.name} frame {i}" for i in range(len(entries))]
-    guess = (int(2 * K[0][1, 2]), int(2 * K[0][0, 2]))
+    middle = np.nan_to_num(np.abs(K[0][[1, 0], 2]), posinf=1.0).clip(1.0, 1e6)
+    guess = (int(2 * middle[0]), int(2 * middle[1]))
     cameras = validate(cameras, *(target or guess), names)
     if "keyframes" in content and "camera_path" not in content:
         times = _times(entries, file)
-        s = np.linspace(0.0, 1.0, frames or content.get("count") or 81)
+        count = content.get("count")
+        count = 81 if count is None else number(count, str(file), "count", low=1, whole=True)
+        s = np.linspace(0.0, 1.0, frames or count)
         return interpolate(cameras, s, times=times)
     if frames is not None and frames != len(cameras):
         raise UserError(
@@ -160,10 +161,19 @@ def _entries(content: dict, file: Path) -> tuple[list[dict], str, str]:
         entries, field, default = content["camera_path"], "camera_to_world", "opengl"
     else:
         entries = content.get("frames", content.get("keyframes"))
-        foreign = isinstance(entries, list) and entries and "transform_matrix" in entries[0]
+        foreign = isinstance(entries, list) and any(
+            isinstance(entry, dict) and "transform_matrix" in entry for entry in entries[:1]
+        )
         field, default = ("transform_matrix", "opengl") if foreign else ("pose", "")
+        if "frames" in content and "keyframes" in content:
+            raise UserError(f"{file}: has both 'frames' and 'keyframes': give one of the two.")
     if not isinstance(entries, list) or not entries:
         raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
+    for i, entry in enumerate(entries):
+        if not isinstance(entry, dict):
+            raise UserError(
+                f"{file}, frame {i}: is no object with '{field}': give a 4x4 matrix there."
+            )
     convention = content.get("convention") or default
     if convention not in CONVENTIONS:
         given = f"convention '{convention}'" if convention else "no 'convention'"
@@ -190,11 +200,20 @@ def _matrix(entry: dict, field: str, where: str) -> np.ndarray:
     return matrix
 
 
-def _size(content: dict) -> tuple[int, int] | None:
+_NUMBERS = ("fl_x", "fl_y", "cx", "cy", "fov", "camera_angle_x")
+
+
+def _size(content: dict, where: str) -> tuple[int, int] | None:
     """(height, width) of the pictures that the file's intrinsics are for."""
-    for h, w in (("height", "width"), ("h", "w"), ("render_height", "render_width")):
-        if content.get(h) and content.get(w):
-            return int(content[h]), int(content[w])
+    for names in (("height", "width"), ("h", "w"), ("render_height", "render_width")):
+        given = [name for name in names if content.get(name) is not None]
+        if len(given) == 1:
+            raise UserError(
+                f"{where}: has '{given[0]}' alone: give both '{names[0]}' and '{names[1]}'."
+            )
+        if given:
+            height, width = (number(content[n], where, n, low=1, whole=True) for n in names)
+            return height, width
     return None
 
 
@@ -207,30 +226,40 @@ def _intrinsics(
     where: str,
 ) -> np.ndarray:
     """K [3, 3] of one entry in pixels of `target`: its own, else the file's, else the context's."""
-    source = next((s for s in (entry, content) if any(k in s for k in ("K", "fl_x", "fov"))), None)
+    known = ("K", "fl_x", "fl_y", "fov", "camera_angle_x")
+    sources = ({k: v for k, v in s.items() if v is not None} for s in (entry, content))
+    source = next((s for s in sources if any(k in s for k in known)), None)
     if source is None:
         if context is None:
             raise UserError(f"{where}: no intrinsics: give 'K' (3x3, pixels) or 'fov' (degrees).")
         return to_host(context).K[0]
-    if "fov" in source and "K" not in source:
-        size = size or target
-        if size is None:
-            raise UserError(f"{where}: 'fov' needs the picture size: give 'height' and 'width'.")
-        fov = float(source["fov"])
-        if not 0 < fov < 180:
-            raise UserError(f"{where}: fov {fov} is the full vertical angle: 0 to 180 degrees.")
-        focal = 0.5 * size[0] / np.tan(np.radians(fov) / 2)
-        K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1.0]])
-    elif "K" in source:
-        K = np.asarray(source["K"], np.float64)
-        if K.shape != (3, 3):
-            raise UserError(f"{where}: 'K' has shape {K.shape}: give a 3x3 matrix in pixels.")
-    else:
-        fx = float(source["fl_x"])
-        fy = float(source.get("fl_y", fx))
+    value = {name: number(source[name], where, name) for name in _NUMBERS if name in source}
+    if "K" in source:
+        K = matrix(source["K"], (3, 3), where, "K")
+    elif "fl_x" in value:
         middle = (0.0, 0.0) if size is None else (size[1] / 2, size[0] / 2)
-        cx, cy = float(source.get("cx", middle[0])), float(source.get("cy", middle[1]))
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+        cx, cy = value.get("cx", middle[0]), value.get("cy", middle[1])
+        K = np.array(
+            [[value["fl_x"], 0, cx], [0, value.get("fl_y", value["fl_x"]), cy], [0, 0, 1.0]]
+        )
+    elif "fl_y" in value:
+        raise UserError(f"{where}: has 'fl_y' alone: give 'fl_x' (pixels) as well.")
+    else:
+        size = size or target
+        name = "fov" if "fov" in value else "camera_angle_x"
+        if size is None:
+            raise UserError(f"{where}: '{name}' needs the picture size: give 'height' and 'width'.")
+        angle, side = value[name], size[0]
+        if name == "fov" and not 0 < angle < 180:
+            raise UserError(f"{where}: fov {angle} is the full vertical angle: 0 to 180 degrees.")
+        if name == "camera_angle_x":
+            if not 0 < angle < np.pi:
+                raise UserError(
+                    f"{where}: camera_angle_x {angle} is the full horizontal angle: 0 to 3.14 radians."
+                )
+            angle, side = np.degrees(angle), size[1]
+        focal = 0.5 * side / np.tan(np.radians(angle) / 2)
+        K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1.0]])
     if target is None:
         return K
     if size is None:
@@ -242,7 +271,9 @@ def _times(entries: list[dict], file: Path) -> np.ndarray | None:
     """The `time` of every key frame, or None if none has one."""
     if not any("time" in entry for entry in entries):
         return None
-    times = np.array([float(entry.get("time", np.nan)) for entry in entries])
+    times = np.array(
+        [number(e.get("time", np.nan), f"{file}, frame {i}", "time") for i, e in enumerate(entries)]
+    )
     if not np.all(np.diff(times) > 0):
         raise UserError(f"{file}: 'time' must be on every key frame, in increasing order.")
     return times

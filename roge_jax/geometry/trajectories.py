@@ -12,10 +12,14 @@ from typing import Any
 import numpy as np
 
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.geometry.cameras import Cameras, to_host
+from roge_jax.fields import number
+from roge_jax.geometry.cameras import Cameras, checked_views, to_host
 from roge_jax.geometry.paths import interpolate, load_path, save_path
 
 __all__ = ["PRESETS", "focus_distance", "load_path", "make_path", "save_path", "world_up"]
+
+
+MOST = 1e6  # of any option: turns, degrees, lengths in units of the focus
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,27 +57,49 @@ def make_path(
       options: the preset's own keywords, e.g. orbit's `degrees`.
     Raises: UserError for an unknown name or option, or a start that is no context view.
     """
-    if name not in PRESETS:
+    if not isinstance(name, str) or name not in PRESETS:
         raise UserError(f"There is no trajectory '{name}': {did_you_mean(name, PRESETS)}")
-    context = to_host(context)
+    where = f"Trajectory '{name}'"
+    context = checked_views(context, "context")
+    frames, start = (
+        number(value, where, word, whole=True)
+        for word, value in (("frames", frames), ("start", start))
+    )
     if frames < 1:
         raise UserError(f"A path of {frames} frames is empty: ask for 1 or more.")
     if not 0 <= start < len(context):
         raise UserError(f"start={start} is no context view: there are {len(context)}, from 0.")
     preset = PRESETS[name]
-    allowed = list(inspect.signature(preset).parameters)[2:]
-    for option in options:
-        if option not in allowed:
-            hint = did_you_mean(option, [*allowed, "start", "focus", "ease"])
-            raise UserError(f"Trajectory '{name}' has no option '{option}': {hint}")
-    distance = focus_distance(context, start) if focus is None else float(focus)
-    if not (np.isfinite(distance) and distance > 0):
+    defaults = {p.name: p.default for p in list(inspect.signature(preset).parameters.values())[2:]}
+    for option, value in options.items():
+        if option not in defaults:
+            hint = did_you_mean(option, [*defaults, "start", "focus", "ease"])
+            raise UserError(f"{where} has no option '{option}': {hint}")
+        options[option] = _option(value, where, option, defaults[option])
+    ease = _option(ease, where, "ease", False)
+    given = focus_distance(context, start) if focus is None else focus
+    distance = number(given, where, "focus")
+    if not 0 < distance < 1e100:
         raise UserError(f"focus={focus} is no distance: give a positive number in scene units.")
     rig = Rig(context.c2w[start], context.K[start], context, distance, world_up(context))
     s = np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1)
     s = s * s * (3.0 - 2.0 * s) if ease else s
     c2w, K = preset(rig, s, **options)
     return Cameras(K, c2w)
+
+
+def _option(value: Any, where: str, name: str, default: Any) -> Any:
+    """The value of a preset's option, which must be of the kind of its default (None: yes or no)."""
+    if default is None or isinstance(default, bool):
+        if value in (True, False) or (default is None and value is None):
+            return value
+        raise UserError(f"{where}: '{name}' is {value!r}: give true or false.")
+    if isinstance(default, str):
+        return value
+    found = number(value, where, name)
+    if not abs(found) <= MOST:
+        raise UserError(f"{where}: '{name}' is {found}: give a number from {-MOST:g} to {MOST:g}.")
+    return found
 
 
 # Where the scene is
@@ -193,12 +219,14 @@ def pan(rig: Rig, s: np.ndarray, degrees: float = 30.0) -> Poses:
 
 def zoom_in(rig: Rig, s: np.ndarray, factor: float = 1.5) -> Poses:
     """The focal length grows to `factor` times; the camera stands still."""
+    if not 0.01 <= factor <= 100:
+        raise UserError(f"factor={factor:g} is no zoom: give 0.01 to 100, 1 changes nothing.")
     return np.repeat(rig.start[None], len(s), 0), _zoomed(rig, factor**s)
 
 
 def zoom_out(rig: Rig, s: np.ndarray, factor: float = 1.5) -> Poses:
     """The focal length shrinks to 1 / `factor`; the camera stands still."""
-    return zoom_in(rig, s, 1.0 / factor)
+    return zoom_in(rig, s, 1.0 / factor if factor else factor)
 
 
 def dolly_zoom_in(rig: Rig, s: np.ndarray, distance: float = 0.3) -> Poses:
