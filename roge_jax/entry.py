@@ -10,13 +10,13 @@ This module imports neither JAX nor NumPy, so that a program can still choose it
 import argparse
 import contextlib
 import datetime
+import errno
 import hashlib
 import importlib.metadata
 import json
 import os
 import platform
 import re
-import shutil
 import subprocess
 import sys
 import time
@@ -29,7 +29,14 @@ from typing import Any, NoReturn
 from .errors import UserError, did_you_mean
 
 CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
-RECORD = "run.json"
+LESS = "ask for less, e.g. fewer frames or photos or a smaller size (--dry-run tells what a run needs)."
+REMEDIES = {
+    errno.ENOSPC: "free some space or give another --out",
+    errno.EDQUOT: "free some space or give another --out",
+    errno.ENOENT: "check the name",
+    errno.EACCES: "ask for the right to use it or give another place",
+    errno.ENAMETOOLONG: "give a shorter name",
+}
 PACKAGES = (
     "roge_jax",
     "jax",
@@ -79,10 +86,31 @@ def execute(
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr)
             return 130
+        except BrokenPipeError:  # `| head` has read enough
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 1
+        except OSError as error:
+            if error.errno is None:  # not the system's: a fault of the program
+                raise
+            return _report(_system(error), 2, debug)
+        except MemoryError as error:
+            return _report(UserError(f"Out of memory ({error}): {LESS}"), 1, debug)
         except RuntimeError as error:
+            if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):  # XLA's words
+                first = str(error).splitlines()[0]
+                return _report(UserError(f"Out of memory ({first}): {LESS}"), 1, debug)
             if not isinstance(error, _expected_stops()):
                 raise
             return _report(error, 1, debug)
+
+
+def _system(error: OSError) -> UserError:
+    """What the operating system refused, as a sentence: a full disk, a missing right, a name too long."""
+    name = str(error.filename or "The system")
+    name = name if len(name) <= 200 else f"{name[:60]}...{name[-20:]}"
+    return UserError(
+        f"{name}: {error.strerror}: {REMEDIES.get(error.errno or 0, 'give another place')}."
+    )
 
 
 def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
@@ -91,13 +119,17 @@ def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse
     def error(message: str) -> NoReturn:
         raise UserError(f"{message[:1].upper()}{message[1:]}; --help explains all options.")
 
-    parser.allow_abbrev = False
-    parser.error = error  # type: ignore[method-assign]
+    parsers = [parser]
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            parsers += action.choices.values()
+    for one in parsers:
+        one.allow_abbrev = False
+        one.error = error  # type: ignore[method-assign]
     args, unknown = parser.parse_known_args(list(arguments))
     if unknown:
-        options = [
-            name for action in parser._actions for name in action.option_strings if name[:2] == "--"
-        ]
+        actions = [action for one in parsers for action in one._actions]
+        options = [name for action in actions for name in action.option_strings if name[:2] == "--"]
         word = unknown[0].partition("=")[0]
         if word.startswith("-"):
             raise UserError(f"Unknown option '{word}': {did_you_mean(word, options)}")
@@ -119,12 +151,15 @@ def one_of(options: Iterable[str]) -> Callable[[str], str]:
     return check
 
 
-def number(low: float | None = None, *, whole: bool = True) -> Callable[[str], Any]:
-    """An argparse `type` for numbers of at least `low`."""
+def number(
+    low: float | None = None, high: float | None = None, *, whole: bool = True
+) -> Callable[[str], Any]:
+    """An argparse `type` for numbers of at least `low` and at most `high`."""
 
     def check(text: str) -> float:
         kind = "whole number" if whole else "number"
         bound = "" if low is None else f" of at least {low:g}"
+        bound += "" if high is None else f"{' and' if bound else ' of'} at most {high:g}"
         try:
             value = int(text) if whole else float(text)
         except ValueError:
@@ -134,6 +169,7 @@ def number(low: float | None = None, *, whole: bool = True) -> Callable[[str], A
             or value != value
             or abs(value) == float("inf")
             or (low is not None and value < low)
+            or (high is not None and value > high)
         ):
             raise argparse.ArgumentTypeError(f"'{text}' is not a {kind}{bound}")
         return value
@@ -346,40 +382,3 @@ def plain(value: Any) -> Any:
         if isinstance(value, float) and (value != value or abs(value) == float("inf"))
         else value
     )
-
-
-# ---- output folders ------------------------------------------------------------------------------
-
-
-@contextlib.contextmanager
-def output_folder(out: str | Path) -> Iterator[Path]:
-    """A new folder to write into, renamed to `out` when the block ends and removed when it fails.
-
-    A folder of an earlier run (it holds run.json) is replaced only then; any other folder that has files in it is
-    left alone. Raises: UserError if `out` cannot be used, before anything is computed.
-    """
-    out = Path(out)
-    if out.exists() and not out.is_dir():
-        raise UserError(f"--out {out} is a file: give a folder.")
-    if out.is_dir() and any(out.iterdir()) and not (out / RECORD).exists():
-        raise UserError(
-            f"--out {out} has files that are not of an earlier run (no {RECORD}): give another folder."
-        )
-    part, old = (out.with_name(out.name + suffix) for suffix in (".part", ".old"))
-    try:
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(
-            f"--out {out} cannot be written ({error.strerror}): give another folder."
-        ) from None
-    try:
-        yield part
-    except BaseException:
-        shutil.rmtree(part, ignore_errors=True)
-        raise
-    shutil.rmtree(old, ignore_errors=True)
-    if out.exists():
-        out.rename(old)
-    part.rename(out)
-    shutil.rmtree(old, ignore_errors=True)

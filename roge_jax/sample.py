@@ -12,14 +12,15 @@ their cameras, in the scene's frame and unit), contact_sheet.png and run.json. d
 
 import argparse
 import dataclasses
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .entry import Clock, environment, number, one_of, output_folder, run, write_json
+from .entry import Clock, environment, number, one_of, run, write_json
 from .errors import UserError, did_you_mean
+from .fields import is_file
+from .folders import output_folder
 
 DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
 TRAJECTORY = "orbit:degrees=12"  # gentle: two photos side by side show little of the rest
@@ -82,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     )
     option("--tolerance", tolerance_help, type=number(0, whole=False))
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)
-    option("--fps", "frames per second", 16.0, type=number(1e-3, whole=False))
+    option("--fps", "frames per second", 16.0, type=number(1e-3, 1000, whole=False))
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     mesh_help = "how to split the work over devices, e.g. fsdp=2,seq=2: weights; tokens and views (one device if not given)"
     option("--mesh", mesh_help)
@@ -133,9 +134,10 @@ def context_ids(text: str | None, scene, most: int) -> list[int]:
 
     if text is None:
         return select_context(scene, min(len(scene), most, DEFAULT_CONTEXT))
-    if "," in text or text in scene.names:
-        return [_view(word.strip(), scene) for word in text.split(",") if word.strip()]
-    if not text.isdigit() or not 1 <= int(text) <= min(len(scene), most):
+    words = [word.strip() for word in text.split(",")]
+    if any(words) and ("," in text or text in scene.names):
+        return [_view(word, scene) for word in words if word]
+    if not text.isdecimal() or not 1 <= int(text) <= min(len(scene), most):
         raise UserError(
             f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
             f"model takes {most}), or photos by number or name, separated by commas."
@@ -146,9 +148,9 @@ def context_ids(text: str | None, scene, most: int) -> list[int]:
 def _view(word: str, scene) -> int:
     if word in scene.names:
         return scene.names.index(word)
-    if word.isdigit() and int(word) < len(scene):
+    if word.isdecimal() and int(word) < len(scene):
         return int(word)
-    if word.isdigit():
+    if word.isdecimal():
         raise UserError(
             f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0."
         )
@@ -160,17 +162,28 @@ def _view(word: str, scene) -> int:
 def camera_path(args: argparse.Namespace, context, config):
     """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video."""
     from .geometry.cameras import Cameras
-    from .geometry.trajectories import PRESETS, load_path, make_path
+    from .geometry.trajectories import PRESETS, load_path, make_path, parse_options
 
     name, _, words = args.trajectory.partition(":")
-    if Path(args.trajectory).suffix.lower() == ".json" or Path(args.trajectory).is_file():
+    file = Path(args.trajectory)
+    if file.suffix.lower() == ".json" or is_file(file):
+        if args.start:
+            raise UserError(
+                f"--start {args.start} is for presets: a path file starts where it says; leave it away."
+            )
         size = {"height": config.height, "width": config.width}
         path = load_path(args.trajectory, frames=args.frames, context=context, **size)
     elif name not in PRESETS and ("/" in name or "." in name):
         raise UserError(f"--trajectory {args.trajectory}: there is no such path file.")
     else:
-        options = dict(_option(word, args.trajectory) for word in words.split(",") if word)
-        path = make_path(name, context, args.frames or config.frames, start=args.start, **options)
+        options = parse_options(words, f"--trajectory {args.trajectory}")
+        if args.start and "start" in options:
+            raise UserError(
+                f"--trajectory {args.trajectory}: 'start' is given twice, with --start {args.start}."
+            )
+        path = make_path(
+            name, context, args.frames or config.frames, **({"start": args.start} | options)
+        )
     if args.fov is not None:
         if not args.fov < 180:
             raise UserError(
@@ -180,18 +193,6 @@ def camera_path(args: argparse.Namespace, context, config):
         K = np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
         path = Cameras(np.repeat(K[None], len(path), 0), path.c2w)
     return path
-
-
-def _option(word: str, trajectory: str) -> tuple[str, Any]:
-    name, equals, value = word.partition("=")
-    if not equals:
-        raise UserError(
-            f"--trajectory {trajectory}: '{word}' is no option: write NAME:OPTION=VALUE,OPTION=VALUE."
-        )
-    try:
-        return name, json.loads(value.lower())
-    except json.JSONDecodeError:
-        return name, value
 
 
 def large_dtype(args: argparse.Namespace, parameters: float) -> str:
@@ -385,22 +386,23 @@ def main(args: argparse.Namespace) -> None:
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text; weights are not read, photos are not decoded."""
     from . import cost, sampling
-    from .data.scene import open_scene
+    from .data.scene import open_scene, procedural_seed
     from .video import solvers
 
     config = model_config(args, weights=False)
-    if args.context is not None and args.context.isdigit():
+    if args.context is not None and args.context.isdecimal():
         m = int(args.context)
         if not 1 <= m <= config.max_context:
             raise UserError(
                 f"--context {m}: this model ({config.name}) takes 1 to {config.max_context} photos."
             )
     elif args.scene.startswith("procedural:"):
+        procedural_seed(args.scene)
         m = min(DEFAULT_CONTEXT, config.max_context)
     else:
         scene = open_scene(args.scene, convention=args.convention)
         m = len(context_ids(args.context, scene, config.max_context))
-    frames = args.frames or config.frames
+    frames = len(camera_path(args, _stand_in(m, config), config))
     adaptive = solvers.SOLVERS[settings.solver].method is None
     count = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)
     guess = " (a guess: it chooses its own steps)" if adaptive else ""
@@ -413,6 +415,18 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         half=large_dtype(args, sum(cost.weight_bytes(config).values()) / 4) == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
+
+
+def _stand_in(m: int, config):
+    """Cameras side by side: enough to know a path's length and whether its options are allowed."""
+    from .geometry.cameras import Cameras
+
+    K = np.array(
+        [[config.width, 0, config.width / 2], [0, config.width, config.height / 2], [0, 0, 1]]
+    )
+    c2w = np.tile(np.eye(4), (m, 1, 1))
+    c2w[:, 0, 3] = 0.1 * np.arange(m)
+    return Cameras(np.tile(K, (m, 1, 1)), c2w)
 
 
 if __name__ == "__main__":

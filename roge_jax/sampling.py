@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import cost, limits, model
+from . import cost, fields, limits, model
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
@@ -64,6 +64,9 @@ class Settings:
         ):
             if word not in allowed:
                 raise UserError(f"Unknown {name} '{word}': {did_you_mean(word, allowed)}")
+        fields.number(self.seed, "Settings", "seed", low=0, whole=True)
+        if self.scale is not None:
+            fields.number(self.scale, "Settings", "scale", low=1e-30)
         if self.schedule != "optimised":  # those belong to a model, which `sample` knows
             flow.schedule(self.schedule, self.steps, solver=self.solver)
 
@@ -131,6 +134,15 @@ def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
     ):  # sharper than a resize of the smaller crop
         recon, _ = prepare_photos(scene, ids, *size, drop_duplicates=False)
     return Photos(images[kept], recon, cameras[kept], tuple(ids))
+
+
+def _check_photos(photos: Photos, config: RoGeConfig) -> None:
+    wanted = (len(photos.ids), config.height, config.width, 3)
+    if np.shape(photos.images) != wanted or len(photos.cameras) != wanted[0]:
+        raise UserError(
+            f"Photos of shape {np.shape(photos.images)} with {len(photos.cameras)} cameras for {wanted[0]} ids do not "
+            f"fit a model of {config.height}x{config.width} ({config.name}): make them with sampling.read_photos."
+        )
 
 
 # ---- compiled pieces -----------------------------------------------------------------------------
@@ -294,7 +306,12 @@ def sample(
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
     given, unplanned = len(photos.ids), config
+    _check_photos(photos, config)
     if plan is not None:
+        if max(plan.choices.photos, default=0) >= given:
+            raise UserError(
+                f"The plan takes photo {max(plan.choices.photos)} of {given}, from 0: plan again for these photos."
+            )
         photos, config, settings = reduced(photos, config, settings, plan.choices)
     context, target, info = normalise(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale
@@ -309,7 +326,10 @@ def sample(
     )
     runs = windows(len(path), config.frames)
     generate = [True] * len(runs) if plan is None else list(plan.choices.generate)
-    assert len(generate) == len(runs), "the plan is for a path of another length"
+    if len(generate) != len(runs):
+        raise UserError(
+            f"The plan is for {len(generate)} windows and this path has {len(runs)}: plan again for this path."
+        )
     bar = _bar(progress, settings, grid, sum(generate))
     frames: list[np.ndarray] = []
     previews: list[np.ndarray] = []

@@ -10,6 +10,7 @@ import pytest
 
 from roge_jax import entry
 from roge_jax.errors import UserError
+from roge_jax.folders import output_folder
 
 
 def program(main, *arguments):
@@ -147,23 +148,23 @@ class TestOutputFolder:
 
     def test_appears_when_complete(self, tmp_path):
         out = tmp_path / "deep" / "out"
-        with entry.output_folder(out) as folder:
+        with output_folder(out) as folder:
             (folder / "a").write_text("1")
             assert not out.exists()
         assert self.left(tmp_path) == ["deep", "deep/out", "deep/out/a"]
 
     def test_earlier_run_survives_a_failure_and_is_replaced_by_success(self, tmp_path):
         out = tmp_path / "out"
-        with entry.output_folder(out) as folder:
+        with output_folder(out) as folder:
             (folder / "run.json").write_text("{}")
             (folder / "old").write_text("")
-        with pytest.raises(KeyboardInterrupt), entry.output_folder(out) as folder:
+        with pytest.raises(KeyboardInterrupt), output_folder(out) as folder:
             (folder / "half").write_text("")
             raise KeyboardInterrupt
         assert self.left(tmp_path) == ["out", "out/old", "out/run.json"]
         (tmp_path / "out.part").mkdir()  # what a killed run leaves
         (tmp_path / "out.part" / "stale").write_text("")
-        with entry.output_folder(out) as folder:
+        with output_folder(out) as folder:
             (folder / "new").write_text("")
         assert self.left(tmp_path) == ["out", "out/new"]
 
@@ -172,14 +173,14 @@ class TestOutputFolder:
         (tmp_path / "file").write_text("")
         with (
             pytest.raises(UserError, match=r"not of an earlier run"),
-            entry.output_folder(tmp_path),
+            output_folder(tmp_path),
         ):
             pass
-        with pytest.raises(UserError, match="is a file"), entry.output_folder(tmp_path / "file"):
+        with pytest.raises(UserError, match="is a file"), output_folder(tmp_path / "file"):
             pass
         with (
             pytest.raises(UserError, match="cannot be written"),
-            entry.output_folder(tmp_path / "file" / "x"),
+            output_folder(tmp_path / "file" / "x"),
         ):
             pass
         assert self.left(tmp_path) == ["file", "thesis.tex"]

@@ -18,6 +18,7 @@ ALLOWED = {
     "errors": set(),
     "lazy": set(),
     "fields": {"errors"},
+    "folders": {"errors"},
     "core": _GROUND,  # knows nothing of RoGe
     "geometry": _GROUND,
     "config": _GROUND,

@@ -6,6 +6,7 @@ Every preset starts from one context camera and is sized by the distance at whic
 
 import dataclasses
 import inspect
+import json
 from collections.abc import Callable
 from typing import Any
 
@@ -16,7 +17,15 @@ from roge_jax.fields import number
 from roge_jax.geometry.cameras import Cameras, checked_views, to_host
 from roge_jax.geometry.paths import interpolate, load_path, save_path
 
-__all__ = ["PRESETS", "focus_distance", "load_path", "make_path", "save_path", "world_up"]
+__all__ = [
+    "PRESETS",
+    "focus_distance",
+    "load_path",
+    "make_path",
+    "parse_options",
+    "save_path",
+    "world_up",
+]
 
 
 MOST = 1e6  # of any option: turns, degrees, lengths in units of the focus
@@ -86,6 +95,28 @@ def make_path(
     s = s * s * (3.0 - 2.0 * s) if ease else s
     c2w, K = preset(rig, s, **options)
     return Cameras(K, c2w)
+
+
+def parse_options(text: str, where: str) -> dict[str, Any]:
+    """ "degrees=90,swing=false" as keywords of `make_path`; `where` is for messages."""
+    options: dict[str, Any] = {}
+    for word in text.split(","):
+        if not word:
+            continue
+        name, equals, value = word.partition("=")
+        if not equals:
+            raise UserError(
+                f"{where}: '{word}' is no option: write NAME:OPTION=VALUE,OPTION=VALUE."
+            )
+        if name in options:
+            raise UserError(f"{where}: '{name}' is given twice.")
+        if name in ("name", "context", "frames"):
+            raise UserError(f"{where}: '{name}' is no option of a path.")
+        try:
+            options[name] = json.loads(value.lower())
+        except (ValueError, RecursionError):
+            options[name] = value
+    return options
 
 
 def _option(value: Any, where: str, name: str, default: Any) -> Any:
