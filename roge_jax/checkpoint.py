@@ -20,6 +20,7 @@ from . import model
 from .config import PRESETS, RoGeConfig, from_dict, to_dict
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
+from .fields import exists, is_file, read_json
 
 SHARD_BYTES = 15_000_000
 ADAPTER = "adapter.safetensors"
@@ -155,16 +156,16 @@ def _put(temporary: Path, folder: Path) -> None:
 def find_model(name: str | Path) -> Path:
     """The folder of a model: a path, or the name of a shipped one."""
     folder = Path(name)
-    if (folder / "config.json").exists():
+    if is_file(folder / "config.json"):
         return folder
     places = [ASSETS] + (
         [Path(os.environ[WEIGHTS_VARIABLE])] if WEIGHTS_VARIABLE in os.environ else []
     )
     for place in places:
-        if (place / str(name) / "config.json").exists():
+        if is_file(place / str(name) / "config.json"):
             return place / str(name)
     known = [p.parent.name for place in places for p in place.glob("*/config.json")]
-    if folder.exists():
+    if exists(folder):
         raise UserError(
             f"{folder} has no config.json: give a folder written by roge_jax.convert or train."
         )
@@ -197,6 +198,11 @@ def load_model(
             f"{folder} is an adapter: `python -m roge_jax.export {folder} --merge BASE` makes a model of it."
         )
     files = sorted(folder.glob("model-*.safetensors"))
+    odd = [file.name for file in files if not file.stem.rsplit("-", 1)[1].isdecimal()]
+    if odd:
+        raise UserError(
+            f"{folder / odd[0]} is not named like model-00001-of-00001.safetensors: give it its name back."
+        )
     expected = int(files[0].stem.rsplit("-", 1)[1]) if files else 1
     if len(files) != expected:
         have = {f.name for f in files}
@@ -321,11 +327,11 @@ def load_config(folder: Path) -> RoGeConfig:
     another kind.
     """
     file = Path(folder) / "config.json"
-    try:
-        record = json.loads(file.read_text())
-        values = record["config"]
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    record = read_json(file, "model config")
+    if not isinstance(record, dict) or "config" not in record:
+        raise UserError(f"{file} is not a roge_jax model config: copy the folder again.")
+    if record.get("format", 1) != 1:
         raise UserError(
-            f"{file} is not a roge_jax model config ({error}): copy the folder again."
-        ) from error
-    return from_dict(values, source=str(file))
+            f"{file}: 'format' is {record['format']!r}, of a newer version: update roge_jax, which reads format 1."
+        )
+    return from_dict(record["config"], source=str(file))

@@ -1,8 +1,9 @@
 """Configurations: frozen dataclasses that hold numbers only, and the presets built from them."""
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from .errors import UserError, did_you_mean
 
@@ -134,13 +135,14 @@ class RoGeConfig:
 
     def __post_init__(self):
         pixels = 8 * self.dit.patch
-        if self.height % pixels or self.width % pixels:
+        if min(self.height, self.width) < 1 or self.height % pixels or self.width % pixels:
             raise UserError(
                 f"Size {self.height}x{self.width} does not fit: height and width must be multiples of "
                 f"{pixels}; try {_nearest(self.height, pixels)}x{_nearest(self.width, pixels)}."
             )
         p = self.renderer.patch
-        if self.recon_height % p or self.recon_width % p:
+        small = min(self.recon_height, self.recon_width) < 1
+        if small or self.recon_height % p or self.recon_width % p:
             raise UserError(
                 f"Reconstruction size {self.recon_height}x{self.recon_width} does not fit: both must be "
                 f"multiples of {p}; try {_nearest(self.recon_height, p)}x{_nearest(self.recon_width, p)}."
@@ -240,17 +242,102 @@ def to_dict(config) -> dict:
 
 
 def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
-    """The inverse of `to_dict`; unknown or missing fields are named in one `UserError`."""
+    """The inverse of `to_dict`; an unknown field or a value of another kind is named in one `UserError`.
+
+    Fields that are missing, because the file is older than they are, take their defaults.
+    """
+    if not isinstance(values, dict):
+        raise UserError(
+            f"{source} is {values!r}: give an object with the fields of {cls.__name__}."
+        )
     known = {f.name: f for f in dataclasses.fields(cls)}
     unknown = sorted(set(values) - set(known))
     if unknown:
         raise UserError(
             f"{source}: unknown field '{unknown[0]}': {did_you_mean(unknown[0], known)}"
         )
-    built = {}
+    hints = get_type_hints(cls)
+    built: dict[str, Any] = {}
     for name, value in values.items():
         default = known[name].default_factory
         if dataclasses.is_dataclass(default):
             value = from_dict(value, default, source=f"{source}.{name}")
-        built[name] = tuple(value) if isinstance(value, list) else value
-    return cls(**built)
+        else:
+            value = tuple(value) if isinstance(value, list) else value
+            if not _fits(value, hints[name]):
+                raise UserError(f"{source}: '{name}' is {value!r}: give {_described(hints[name])}.")
+        built[name] = value
+    for name in POSITIVE:
+        if name in built and built[name] <= 0:
+            raise UserError(f"{source}: '{name}' is {built[name]}: it must be above 0.")
+    made = cls(**built)
+    width, heads = (int(getattr(made, name, 1)) for name in ("width", "heads"))
+    if hasattr(made, "heads") and width % heads:
+        raise UserError(
+            f"{source}: width {width} is not divisible by {heads} heads: correct one of them."
+        )
+    return _checked_vae(made, source) if isinstance(made, VAEConfig) else made
+
+
+# Sizes without which there is no network; other counts may be 0, which leaves something out.
+POSITIVE = (
+    "patch",
+    "width",
+    "heads",
+    "base",
+    "latent",
+    "chunk",
+    "max_context",
+    "in_channels",
+    "shift",
+)
+
+
+def _checked_vae(cfg: VAEConfig, source: str) -> VAEConfig:
+    for name in ("latent_mean", "latent_std"):
+        if len(getattr(cfg, name)) != cfg.latent:
+            raise UserError(
+                f"{source}: '{name}' has {len(getattr(cfg, name))} values for {cfg.latent} channels."
+            )
+    if not all(x > 0 for x in cfg.latent_std):
+        raise UserError(f"{source}: 'latent_std' must be positive in every channel.")
+    return cfg
+
+
+def _fits(value, hint) -> bool:
+    """Whether a value read from JSON is of the kind that a field's type hint asks for; whole numbers are not negative."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return value in arguments and not isinstance(value, bool)
+    if kind is tuple:
+        return (
+            isinstance(value, tuple)
+            and len(value) > 0
+            and all(_fits(x, arguments[0]) for x in value)
+        )
+    if kind is not None:  # a union
+        return any(_fits(value, option) for option in arguments)
+    if hint is float:
+        return (
+            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        )
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, hint)
+
+
+def _described(hint) -> str:
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return "one of " + ", ".join(map(str, arguments))
+    if kind is tuple:
+        return f"a list, of each {_described(arguments[0])}"
+    if kind is not None:
+        return " or ".join(_described(option) for option in arguments)
+    words = {
+        int: "a whole number of at least 0",
+        float: "a number",
+        bool: "true or false",
+        str: "a word",
+    }
+    return words.get(hint, "null")

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from .entry import one_of
+from .entry import number, one_of
 
 NETWORKS = ("encoder", "renderer", "vae", "dit")
 CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mask 4, condition 16
@@ -62,7 +62,7 @@ def parser() -> argparse.ArgumentParser:
         help="networks to initialise randomly instead: encoder renderer vae dit",
     )
     p.add_argument(
-        "--seed", type=int, default=0, help="of everything that is initialised (default: 0)"
+        "--seed", type=number(0), default=0, help="of everything that is initialised (default: 0)"
     )
     p.add_argument("--out", type=Path, help="new model folder")
     p.add_argument(
@@ -72,7 +72,10 @@ def parser() -> argparse.ArgumentParser:
         help="of the large frozen matrices (default: bfloat16); all else is float32",
     )
     p.add_argument(
-        "--shard-gb", type=float, default=4.0, help="largest size of one file in GB (default: 4)"
+        "--shard-gb",
+        type=number(1e-6, 1e6, whole=False),
+        default=4.0,
+        help="largest size of one file in GB (default: 4)",
     )
     p.add_argument(
         "--dry-run", action="store_true", help="print what would be done, from headers alone"

@@ -12,7 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from .entry import number
 from .errors import UserError
+from .folders import output_file
 
 HELD_OUT = "procedural:1000000000..1000000049"
 
@@ -31,13 +33,16 @@ def parser() -> argparse.ArgumentParser:
         default=[HELD_OUT],
         help=f"scene folders, 'motorcycle', procedural:SEED or procedural:FIRST..LAST\n(default: {HELD_OUT})",
     )
-    p.add_argument("--context", type=int, default=3, help="photos per scene (default: 3)")
-    p.add_argument("--steps", type=int, default=20, help="sampling steps (default: 20)")
+    p.add_argument("--context", type=number(1), default=3, help="photos per scene (default: 3)")
+    p.add_argument("--steps", type=number(1), default=20, help="sampling steps (default: 20)")
     p.add_argument("--solver", default="euler", help="sampler (default: euler)")
     p.add_argument("--schedule", default="shift", help="noise levels of the steps (default: shift)")
-    p.add_argument("--seed", type=int, default=0, help="seed of the noise")
+    p.add_argument("--seed", type=number(0), default=0, help="seed of the noise")
     p.add_argument(
-        "--sweep", type=float, nargs=2, help="degrees that procedural paths turn, LOW HIGH"
+        "--sweep",
+        type=number(-720, 720, whole=False),
+        nargs=2,
+        help="degrees that procedural paths turn, LOW HIGH",
     )
     p.add_argument(
         "--out",
@@ -56,8 +61,11 @@ def expand(specs: list[str]) -> list[str]:
     for spec in specs:
         if spec.startswith("procedural:") and ".." in spec:
             first, _, last = spec.removeprefix("procedural:").partition("..")
-            if not (first.isdigit() and last.isdigit() and int(first) <= int(last)):
-                raise UserError(f"'{spec}' is no range of seeds: write procedural:FIRST..LAST.")
+            decimal = first.isdecimal() and last.isdecimal()
+            if not decimal or not int(first) <= int(last) < 2**31:
+                raise UserError(
+                    f"'{spec}' is no range of seeds: write procedural:FIRST..LAST, below 2^31."
+                )
             names += [f"procedural:{seed}" for seed in range(int(first), int(last) + 1)]
         else:
             names.append(spec)
@@ -83,11 +91,8 @@ def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) ->
     if name.startswith("procedural:"):
         from .data.procedural import SWEEP, sample_sequence
 
-        seed = name.removeprefix("procedural:")
-        if not seed.isdigit():
-            raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.")
         made = sample_sequence(
-            int(seed),
+            scenes.procedural_seed(name),
             frames=frames + contexts,
             height=size[0],
             width=size[1],
@@ -181,11 +186,23 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     from .metrics import image, report
     from .metrics.baselines import baselines
 
+    output_file(args.out, "--out")
+    if args.sheet:
+        output_file(args.sheet, "--sheet", ".png")
+    names = expand(args.scenes)
+    twice = {name for name in names if names.count(name) > 1} if len(names) < 10000 else set()
+    if twice:
+        raise UserError(f"--scenes names '{min(twice)}' twice: give every scene once.")
+    if args.sweep and not args.sweep[0] <= args.sweep[1]:
+        raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
     evaluator = Evaluator(args.checkpoint, args.solver, args.steps, args.seed, args.schedule)
     config = evaluator.config
     size = (config.height, config.width)
     results, rows, methods = [], [], []
-    names = expand(args.scenes)
+    if args.context > config.max_context:
+        raise UserError(
+            f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
+        )
     for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
         scene = read(name, args.context, config.frames, size, args.sweep)
         m = len(scene["context"])
@@ -226,14 +243,12 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "metrics": image.SETTINGS,
     }
     document = report.build(settings, results, models=("generated", "rgb_head"))
-    args.out.parent.mkdir(parents=True, exist_ok=True)
     report.write_json(args.out, document)
     print(report.table(document))
     print(f"wrote {args.out}")
     if args.sheet:
         from PIL import Image
 
-        args.sheet.parent.mkdir(parents=True, exist_ok=True)
         labels = [*(f"photo {i}" for i in range(args.context)), "truth", *methods]
         sheet = report.contact_sheet(
             rows[:12], labels, row_labels=[r["scene"] for r in results[:12]]

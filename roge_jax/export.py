@@ -14,7 +14,7 @@ import functools
 import json
 from pathlib import Path
 
-from .entry import one_of
+from .entry import number, one_of
 
 STYLES = ("diffusers", "peft", "framecrafter", "comfyui")
 FILES = {
@@ -41,7 +41,10 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--out", type=Path, required=True, help="new folder")
     p.add_argument(
-        "--shard-gb", type=float, default=4.0, help="with --merge: largest size of one file in GB"
+        "--shard-gb",
+        type=number(1e-6, 1e6, whole=False),
+        default=4.0,
+        help="with --merge: largest size of one file in GB",
     )
     p.add_argument("--debug", action="store_true", help="show tracebacks")
     return p

@@ -39,6 +39,14 @@ def is_file(place: Path) -> bool:
         return False
 
 
+def exists(place: Path) -> bool:
+    """Whether there is such a file or folder; False, too, for names that nothing can have."""
+    try:
+        return place.exists()
+    except (OSError, ValueError):
+        return False
+
+
 def number(
     value: Any, where: str, name: str, *, low: float | None = None, whole: bool = False
 ) -> Any:

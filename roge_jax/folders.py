@@ -49,6 +49,27 @@ def output_folder(out: str | Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
 
 
+def output_file(file: Path, option: str, *suffixes: str) -> Path:
+    """`file`, whose folder now exists. Raises UserError if it cannot become a file, before anything is computed."""
+    file = Path(file)
+    if suffixes and file.suffix.lower() not in suffixes:
+        raise UserError(
+            f"{option} {_shown(file)}: give a name that ends in {' or '.join(suffixes)}."
+        )
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        problem = "it is a folder" if file.is_dir() else ""
+        if not problem and not os.access(file if file.exists() else file.parent, os.W_OK):
+            problem = "it is not writable"
+    except (OSError, ValueError) as error:
+        problem = getattr(error, "strerror", None) or str(error)
+    if problem:
+        raise UserError(
+            f"{option} {_shown(file)} cannot be written ({problem}): give another file."
+        )
+    return file
+
+
 def _resolved(out: Path) -> Path:
     try:
         resolved = out.resolve()

@@ -16,6 +16,8 @@ import functools
 import math
 from pathlib import Path
 
+from .entry import number
+
 RECIPES = ("lora", "hires", "all")
 
 
@@ -46,21 +48,27 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)"
     )
-    p.add_argument("--steps", type=int, help="optimiser steps (default: the stage's own)")
+    p.add_argument("--steps", type=number(1), help="optimiser steps (default: the stage's own)")
     p.add_argument(
         "--scale",
-        type=float,
+        type=number(1e-6, 1e6, whole=False),
         default=1.0,
         help="multiplies the steps of every stage of --stage all",
     )
-    p.add_argument("--batch", type=int, help="scenes per step (default: the stage's own)")
-    p.add_argument("--lr", type=float, help="learning rate (default: the stage's own)")
+    p.add_argument("--batch", type=number(1), help="scenes per step (default: the stage's own)")
+    p.add_argument(
+        "--lr",
+        type=number(1e-12, 1e3, whole=False),
+        help="learning rate (default: the stage's own)",
+    )
     p.add_argument(
         "--size", help="HEIGHTxWIDTH (default: the model's own; stage hires: 1.5 times that)"
     )
-    p.add_argument("--seed", type=int, default=0)
+    p.add_argument("--seed", type=number(0), default=0)
     p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
-    p.add_argument("--devices", type=int, help="devices to use, on one machine (default: all)")
+    p.add_argument(
+        "--devices", type=number(1), help="devices to use, on one machine (default: all)"
+    )
     p.add_argument(
         "--mesh",
         help="how to split the work, e.g. data=2,fsdp=2,seq=2: scenes, weights, tokens and views of a\n"
@@ -87,20 +95,22 @@ def parser() -> argparse.ArgumentParser:
         "needed; matrices of models above 1e9 parameters count as bfloat16, their attention as fused",
     )
     p.add_argument(
-        "--context", type=int, help="photos per scene that --dry-run counts (default: the most)"
+        "--context",
+        type=number(1),
+        help="photos per scene that --dry-run counts (default: the most)",
     )
-    p.add_argument("--save-every", type=int, default=100, help="steps between checkpoints")
-    p.add_argument("--log-every", type=int, default=10, help="steps between log lines")
+    p.add_argument("--save-every", type=number(1), default=100, help="steps between checkpoints")
+    p.add_argument("--log-every", type=number(1), default=10, help="steps between log lines")
     p.add_argument(
         "--diagnose-every",
-        type=int,
+        type=number(0),
         default=0,
         help="steps between gradient norms of the two loss terms, their cosine, and the flow loss by\n"
         "noise level (joint stages)",
     )
     p.add_argument(
         "--evaluate-every",
-        type=int,
+        type=number(0),
         default=0,
         help="steps between evaluations on 16 held-out scenes; also one before the first step",
     )

@@ -10,7 +10,7 @@ import pytest
 
 from roge_jax import entry
 from roge_jax.errors import UserError
-from roge_jax.folders import output_folder
+from roge_jax.folders import output_file, output_folder
 
 
 def program(main, *arguments):
@@ -18,6 +18,7 @@ def program(main, *arguments):
     parser.add_argument("--steps", type=entry.number(1), default=3)
     parser.add_argument("--rate", type=entry.number(0.5, whole=False), default=1.0)
     parser.add_argument("--solver", type=entry.one_of(["euler", "heun"]), default="euler")
+    parser.add_argument("--share", type=entry.number(0, 1, whole=False))
     parser.add_argument("--debug", action="store_true")
     return entry.execute(main, parser, arguments)
 
@@ -53,6 +54,34 @@ class TestExitCodes:
         assert program(failing(SamplingError("The velocity is not finite at step 3."))) == 1
         assert capsys.readouterr().err == "error: The velocity is not finite at step 3.\n"
 
+    @pytest.mark.parametrize(
+        ("error", "code", "said"),
+        [
+            (
+                OSError(28, "No space left on device", "/x/a.png"),
+                2,
+                "/x/a.png: No space left on device: free some",
+            ),
+            (
+                PermissionError(13, "Permission denied", "/x"),
+                2,
+                "/x: Permission denied: ask for the right",
+            ),
+            (OSError(36, "File name too long", "x" * 5000), 2, "give a shorter name"),
+            (MemoryError("7 TiB"), 1, "Out of memory (7 TiB): ask for less"),
+            (
+                RuntimeError("RESOURCE_EXHAUSTED: 9 GB"),
+                1,
+                "Out of memory (RESOURCE_EXHAUSTED: 9 GB)",
+            ),
+        ],
+    )
+    def test_what_the_system_refuses_is_one_sentence(self, error, code, said, capsys):
+        assert program(failing(error)) == code
+        shown = capsys.readouterr().err
+        assert shown.startswith("error: ") and said in shown
+        assert shown.count("\n") == 1 and len(shown) < 400
+
     def test_faults_of_the_program_are_not_dressed_up(self):
         with pytest.raises(RuntimeError, match="internal"):
             program(failing(RuntimeError("internal")))
@@ -85,6 +114,7 @@ class TestExitCodes:
         (["--rate", "nan"], "'nan' is not a number of at least 0.5"),
         (["--rate", "0.4"], "'0.4' is not a number of at least 0.5"),
         (["stray"], "'stray' belongs to no option"),
+        (["--share", "1.5"], "'1.5' is not a number of at least 0 and at most 1"),
     ],
 )
 def test_wrong_options_are_one_sentence(arguments, said, capsys):
@@ -167,6 +197,39 @@ class TestOutputFolder:
         with output_folder(out) as folder:
             (folder / "new").write_text("")
         assert self.left(tmp_path) == ["out", "out/new"]
+
+    def test_two_runs_do_not_share_a_folder(self, tmp_path):
+        with output_folder(tmp_path / "out") as folder:
+            (folder / "run.json").write_text("{}")
+            with (
+                pytest.raises(UserError, match="is being written by another run"),
+                output_folder(tmp_path / "out"),
+            ):
+                pass
+        assert self.left(tmp_path) == ["out", "out/run.json"]
+
+    def test_links_stay_links(self, tmp_path):
+        (tmp_path / "real").mkdir()
+        for name, target in (("link", "real"), ("early", "later")):
+            (tmp_path / name).symlink_to(target)
+            with output_folder(tmp_path / name) as folder:
+                (folder / "a").write_text("1")
+            assert (tmp_path / name).is_symlink() and (tmp_path / target / "a").exists()
+        assert not list(tmp_path.glob("*.part")) + list(tmp_path.glob("*.old"))
+
+    @pytest.mark.parametrize("name", ["/", "x" * 300, "loop", "a\0b"])
+    def test_names_that_no_folder_can_have(self, name, tmp_path):
+        (tmp_path / "loop").symlink_to("loop")
+        with pytest.raises(UserError, match=r"^--out "), output_folder(tmp_path / name):
+            pass
+
+    @pytest.mark.parametrize("name", ["folder.png", "file/x.png", "x.txt", "x" * 300 + ".png"])
+    def test_files_that_cannot_be_written(self, name, tmp_path):
+        (tmp_path / "folder.png").mkdir()
+        (tmp_path / "file").write_text("")
+        with pytest.raises(UserError, match=r"^--sheet "):
+            output_file(tmp_path / name, "--sheet", ".png")
+        assert output_file(tmp_path / "new" / "x.png", "--sheet", ".png").parent.is_dir()
 
     def test_foreign_folders_and_files_are_not_touched(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("precious")

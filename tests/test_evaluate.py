@@ -5,7 +5,7 @@ import json
 import jax
 import pytest
 
-from roge_jax import evaluate
+from roge_jax import entry, evaluate
 from roge_jax.checkpoint import save_model
 from roge_jax.config import preset
 from roge_jax.errors import UserError
@@ -58,7 +58,30 @@ def test_contexts_are_spread_and_targets_are_the_rest():
         evaluate.spread(3, 3, 17)
 
 
-@pytest.mark.parametrize("spec", ["procedural:5..2", "procedural:a..b"])
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--context", "0"], "'0' is not a whole number of at least 1"),
+        (["--steps", "-1"], "'-1' is not a whole number of at least 1"),
+        (["--sweep", "nan", "5"], "'nan' is not a number"),
+        (["--sweep", "50", "10"], "give LOW, then HIGH"),
+        (["--scenes", "a", "a"], "--scenes names 'a' twice"),
+        (["--out", "{}"], "it is a folder"),
+        (["--out", "{}/file/x.json"], "cannot be written"),
+        (["--sheet", "x.txt"], "ends in .png"),
+    ],
+)
+def test_mistakes_are_found_before_the_model_is_read(words, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(evaluate, "Evaluator", lambda *_: pytest.fail("must not run"))
+    (tmp_path / "file").write_text("")
+    words = ["--out", f"{tmp_path}/r.json", *(word.format(tmp_path) for word in words)]
+    assert entry.execute(evaluate.main, evaluate.parser(), words) == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "spec", ["procedural:5..2", "procedural:a..b", "procedural:²..³", "procedural:0..99999999999"]
+)
 def test_a_wrong_range_of_seeds_is_named(spec):
     with pytest.raises(UserError, match="FIRST"):
         evaluate.expand([spec])

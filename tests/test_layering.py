@@ -27,7 +27,7 @@ ALLOWED = {
     "fusion": _BASE,
     "model": _PARTS,
     "weights": _PARTS,
-    "data": _BASE,  # neither networks nor metrics
+    "data": _BASE | {"entry", "folders"},  # neither networks nor metrics; a program writes pools
     "metrics": _BASE,
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},

@@ -408,3 +408,50 @@ def test_training_pools_are_varied_and_held_out_ones_are_not(monkeypatch, tmp_pa
     pool_module.main([*command, "0", "--no-varied"])
     pool_module.main([*command, str(HELDOUT_SEED)])
     assert [options["varied"] for options in asked] == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["pool"], "required: --out"),
+        (["pol"], "invalid choice"),
+        (["pool", "--out", "{}/p", "--scenes", "0"], "'0' is not a whole number of at least 1"),
+        (["pool", "--out", "{}/p", "--height", "wide"], "'wide' is not a whole number"),
+        (["pool", "--out", "{}/p", "--hight", "8"], "did you mean '--height'"),
+        (["pool", "--out", "{}/torn"], "pool.json: not valid JSON"),
+        (["pool", "--out", "{}/file"], "File exists"),
+        (["sheet", "--out", "{}/x.txt"], "ends in .png"),
+        (["bench", "--frames", "-1"], "'-1' is not a whole number"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_one_sentence(words, said, tmp_path, capsys):
+    (tmp_path / "torn").mkdir()
+    (tmp_path / "torn" / "pool.json").write_text("{")
+    (tmp_path / "file").write_text("")
+    assert pool_module.main([word.format(tmp_path) for word in words]) == 2
+    shown = capsys.readouterr().err
+    assert said in shown and shown.startswith("error: ") and shown.count("\n") == 1
+
+
+def _shard(folder):
+    np.save(folder / "shard_00000.rgb.npy", np.zeros((2, 6, 8, 8, 3), np.uint8))
+    views = {"K": np.zeros((2, 6, 3, 3)), "c2w": np.zeros((2, 6, 4, 4))}
+    np.savez(folder / "shard_00000.npz", seeds=np.arange(2), **views)
+    return folder / "shard_00000.rgb.npy", folder / "shard_00000.npz"
+
+
+@pytest.mark.parametrize("damage", ["no pictures", "cut", "junk", "floats", "cut cameras", "no K"])
+def test_damaged_shards_are_named(damage, tmp_path):
+    rgb, cameras = _shard(tmp_path)
+    assert len(read_pool(tmp_path)) == 2
+    changes = {
+        "no pictures": rgb.unlink,
+        "cut": lambda: rgb.write_bytes(rgb.read_bytes()[:500]),
+        "junk": lambda: rgb.write_bytes(b"x"),
+        "floats": lambda: np.save(rgb, np.zeros((2, 6, 8, 8, 3))),
+        "cut cameras": lambda: cameras.write_bytes(cameras.read_bytes()[:99]),
+        "no K": lambda: np.savez(cameras, seeds=np.arange(2)),
+    }
+    changes[damage]()
+    with pytest.raises(UserError, match=r"shard_00000: .*write the pool again"):
+        read_pool(tmp_path)

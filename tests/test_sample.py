@@ -471,6 +471,21 @@ BAD = {
     "size that is none": (["--size", "large"], "'large' is not HEIGHTxWIDTH"),
     "impossible field of view": (["--fov", "180"], "between 0 and 180"),
     "start that is no photo": (["--start", "4"], "start=4 is no context view"),
+    "size of nothing": (["--size", "0x0"], "must be multiples of 16"),
+    "size below nothing": (["--size=-16x-16"], "must be multiples of 16"),
+    "superscript for a photo": (["--context", "²,"], "no photo '²'"),
+    "superscript for a number": (["--context", "²"], "--context ²: give 1 to 4"),
+    "commas alone": (["--context", ",,"], "--context ,,: give 1 to 4"),
+    "too many pictures a second": (["--fps", "1e9"], "and at most 1000"),
+    "word for degrees": (["--trajectory", "orbit:degrees=wide"], "'degrees' is 'wide'"),
+    "word for yes": (["--trajectory", "orbit:swing=maybe"], "give true or false"),
+    "option given twice": (["--trajectory", "orbit:degrees=3,degrees=4"], "is given twice"),
+    "start given twice": (["--trajectory", "orbit:start=1", "--start", "2"], "is given twice"),
+    "frames as an option": (["--trajectory", "orbit:frames=3"], "'frames' is no option of a path"),
+    "start of a path file": (["--trajectory", "gone.json", "--start", "2"], "is for presets"),
+    "endless name of a path": (["--trajectory", "x" * 300], "There is no trajectory"),
+    "endless name of a scene": (["--scene", "x" * 300], "There is no scene"),
+    "endless name of a model": (["--checkpoint", "x" * 300], "Unknown checkpoint"),
     "no optimised schedule": (
         ["--schedule", "optimised", "--steps", "777"],
         "No optimised schedule",
@@ -490,6 +505,115 @@ def expect_refusal(code, said, place, capsys, out="bad"):
 def test_bad_options_are_refused_in_one_sentence(case, place, capsys):
     words, said = BAD[case]
     expect_refusal(program(place, *words, out="bad"), said, place, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--trajectory", "orbti"], "did you mean 'orbit'?"),
+        (["--trajectory", "orbit:degrees=wide"], "'degrees' is 'wide'"),
+        (["--scene", "procedural:abc"], "whole number"),
+        (["--fov", "500"], "between 0 and 180"),
+        (["--size", "0x0"], "must be multiples of 16"),
+    ],
+)
+def test_dry_runs_refuse_the_same(words, said, place, capsys):
+    expect_refusal(program(place, "--dry-run", *words, out="bad"), said, place, capsys)
+
+
+def test_a_dry_run_counts_the_frames_of_a_path_file(place, photos, capsys, tmp_path):
+    from roge_jax.geometry.paths import save_path
+
+    path = make_path("spiral", photos.cameras, 7)
+    save_path(tmp_path / "p.json", path, CONFIG.height, CONFIG.width)
+    assert program(place, "--dry-run", "--trajectory", tmp_path / "p.json", out="dry") == 0
+    assert "7 frames of" in capsys.readouterr().out
+
+
+def _in(name, value):
+    def change(record):
+        *parents, last = name.split(".")
+        values = record["config"]
+        for parent in parents:
+            values = values[parent]
+        values[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (b"", "not valid JSON"),
+        (b"\xff\xfe", "no UTF-8 text"),
+        (b"[" * 100000, "not valid JSON"),
+        (b"[]", "is not a roge_jax model config"),
+        (b'{"config": []}', r"is \[\]: give an object with the fields of RoGeConfig"),
+        (lambda record: record.update(format=99), "'format' is 99, of a newer version"),
+        (_in("dit", None), r"config.json.dit is None: give an object"),
+        (_in("dit.width", "wide"), "'width' is 'wide': give a whole number"),
+        (_in("dit.width", 64.5), "'width' is 64.5: give a whole number"),
+        (_in("dit.width", 0), "'width' is 0: it must be above 0"),
+        (_in("dit.heads", 7), "width 64 is not divisible by 7 heads"),
+        (_in("height", None), "'height' is None: give a whole number"),
+        (_in("height", 0), "must be multiples of 16"),
+        (_in("frames", True), "'frames' is True: give a whole number"),
+        (_in("renderer.attention", "x"), "give one of bidirectional, cross, full"),
+        (_in("renderer.merge", 3), "give one of 1, 2, 4"),
+        (_in("vae.multipliers", 3), "give a list, of each a whole number"),
+        (_in("vae.latent_mean", [1.0]), "'latent_mean' has 1 values for 16 channels"),
+        (_in("vae.latent_std", [0.0] * 16), "'latent_std' must be positive"),
+        (_in("flow.shift", -1.0), "'shift' is -1.0: it must be above 0"),
+        (_in("max_context", 0), "'max_context' is 0"),
+    ],
+)
+def test_damaged_configurations_are_named(change, said, place, tmp_path):
+    content = (place / "model" / "config.json").read_bytes()
+    if not isinstance(change, bytes):
+        record = json.loads(content)
+        change(record)
+        content = json.dumps(record).encode()
+    (tmp_path / "config.json").write_bytes(content if not isinstance(change, bytes) else change)
+    with pytest.raises(UserError, match=said):
+        checkpoint.load_config(tmp_path)
+
+
+def test_shards_that_are_none_are_named(place, tmp_path):
+    import shutil
+
+    shutil.copytree(place / "model", tmp_path / "m")
+    file = next((tmp_path / "m").glob("*.safetensors"))
+    file.rename(tmp_path / "m" / "model-weights.safetensors")
+    with pytest.raises(UserError, match=r"model-weights.safetensors is not named like"):
+        checkpoint.load_model(tmp_path / "m")
+    (tmp_path / "m" / "model-weights.safetensors").unlink()
+    file.mkdir()
+    with pytest.raises(UserError, match="cannot be read"):
+        checkpoint.load_model(tmp_path / "m")
+    file.rmdir()
+    file.write_bytes((100000).to_bytes(8, "little") + b"[" * 100000)
+    with pytest.raises(UserError, match="no readable safetensors header"):
+        checkpoint.load_model(tmp_path / "m")
+
+
+def test_wrong_arguments_from_python_are_named(weights, photos):
+    path = make_path("orbit", photos.cameras, WINDOW)
+    for settings, said in (({"seed": -1}, "'seed' is -1"), ({"scale": "2x"}, "'scale' is '2x'")):
+        with pytest.raises(UserError, match=said):
+            sampling.Settings(**settings)
+    small = photos._replace(images=photos.images[:, :16])
+    with pytest.raises(UserError, match=r"make them with sampling\.read_photos"):
+        sampling.sample(weights, CONFIG, small, path, SETTINGS)
+    size = (CONFIG.recon_height, CONFIG.recon_width)
+    for kept, generate, said in (
+        ((0,), (True, True), "2 windows"),
+        ((7,), (True,), "photo 7 of 4"),
+    ):
+        choices = sampling.Choices(kept, 2, "euler", "uniform", size, 1, generate)
+        with pytest.raises(UserError, match=said):
+            sampling.sample(
+                weights, CONFIG, photos, path, SETTINGS, plan=type("P", (), {"choices": choices})
+            )
 
 
 NAN_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, float("nan")], [0, 0, 0, 1]]

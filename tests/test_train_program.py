@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_sharding import small
 
-from roge_jax import config, model, train
+from roge_jax import config, entry, model, train
 from roge_jax.checkpoint import load_model
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
@@ -64,6 +64,21 @@ def test_unknown_stage_and_batch_that_does_not_divide_are_refused(tmp_path):
         run("tiny", "--stage", "recom", "--out", tmp_path)
     with pytest.raises(UserError, match="mini"):
         run("minni", "--out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--steps", "0"], ["--steps", "-1"], ["--batch", "0"], ["--lr", "nan"], ["--lr", "0"], ["--scale", "nan"],
+        ["--seed", "-1"], ["--devices", "-1"], ["--save-every", "0"], ["--log-every", "0"], ["--evaluate-every", "-1"],
+        ["--context", "0"],
+    ],
+)  # fmt: skip
+def test_numbers_that_mean_nothing_are_refused(words, tmp_path, capsys):
+    arguments = ["tiny", "--out", str(tmp_path / "out"), *words]
+    assert entry.execute(train.main, train.parser(), arguments) == 2
+    assert f"'{words[1]}' is not a " in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_stage_gets_what_its_objective_reads():

@@ -13,15 +13,18 @@ import fcntl
 import json
 import multiprocessing
 import os
-import sys
 import time
+import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
+from roge_jax.fields import read_json
+from roge_jax.folders import output_file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +114,10 @@ def _sole_writer(path: Path) -> Iterator[None]:
 
 def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int) -> None:
     record = path / "pool.json"
-    if record.exists() and (old := json.loads(record.read_text())) != settings:
+    old = read_json(record, "record of a pool") if record.exists() else settings
+    if not isinstance(old, dict):
+        raise UserError(f"{record} is no record of a pool: write into another folder.")
+    if old != settings:
         wrong = ", ".join(
             f"{k} {old.get(k)} (asked: {v})" for k, v in settings.items() if old.get(k) != v
         )
@@ -220,15 +226,30 @@ def read_pool(path: str | Path) -> Pool:
             f"{path} holds no finished shard_*.npz; write one with "
             f"`python -m roge_jax.data.procedural pool --out {path}`."
         )
-    cameras = []
+    cameras: list[dict[str, np.ndarray]] = []
+    pixels: dict[str, list[np.ndarray]] = {"rgb": [], "depth": []}
     for stem in stems:
-        with np.load(stem.with_suffix(".npz")) as stored:
-            cameras.append({name: stored[name] for name in ("seeds", "K", "c2w")})
+        try:
+            with stem.with_suffix(".npz").open("rb") as file, np.load(file) as stored:
+                cameras.append({name: stored[name] for name in ("seeds", "K", "c2w")})
+            for name, maps in pixels.items():
+                array = stem.with_suffix(f".{name}.npy")
+                if name == "rgb" or array.exists():
+                    maps.append(np.load(array, mmap_mode="r"))
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+            raise UserError(
+                f"{stem}: this shard is damaged or incomplete ({error}): remove its files and write the pool again."
+            ) from None
+        rgb, shape = pixels["rgb"][-1], cameras[-1]["K"].shape
+        if rgb.ndim != 5 or rgb.dtype != np.uint8 or rgb.shape[:2] != shape[:2]:
+            raise UserError(
+                f"{stem}: its pictures are {rgb.dtype} {rgb.shape}, its K {shape}: remove its files and write the "
+                "pool again."
+            )
     lengths = [len(entry["seeds"]) for entry in cameras]
-    depth = [p for stem in stems if (p := stem.with_suffix(".depth.npy")).exists()]
     return Pool(
-        rgb=[np.load(stem.with_suffix(".rgb.npy"), mmap_mode="r") for stem in stems],
-        depth=[np.load(p, mmap_mode="r") for p in depth],
+        rgb=pixels["rgb"],
+        depth=pixels["depth"],
         starts=np.cumsum([0, *lengths[:-1]]),
         **{name: np.concatenate([entry[name] for entry in cameras]) for name in cameras[0]},
     )
@@ -242,6 +263,7 @@ def _sheet(
 
     from roge_jax.data.procedural import sample_sequence
 
+    output_file(out, "--out", ".png")
     rows = []
     for seed in seeds:
         scene = sample_sequence(
@@ -282,16 +304,16 @@ def _bench(height: int, width: int, frames: int, supersample: int) -> dict:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str] | None = None) -> int:
     """`python -m roge_jax.data.procedural {pool,sheet,bench}`."""
     parser = argparse.ArgumentParser(prog="python -m roge_jax.data.procedural")
     commands = parser.add_subparsers(dest="command", required=True)
     pool = commands.add_parser("pool", help="render many sequences into a folder")
     pool.add_argument("--out", type=Path, required=True)
-    pool.add_argument("--scenes", type=int, default=2000)
-    pool.add_argument("--first-seed", type=int, default=0)
-    pool.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    pool.add_argument("--scenes-per-shard", type=int, default=100)
+    pool.add_argument("--scenes", type=number(1, 10**7), default=2000)
+    pool.add_argument("--first-seed", type=number(), default=0)
+    pool.add_argument("--processes", type=number(1), default=os.cpu_count() or 1)
+    pool.add_argument("--scenes-per-shard", type=number(1), default=100)
     pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
     pool.add_argument(
         "--varied",
@@ -300,22 +322,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     sheet = commands.add_parser("sheet", help="draw a contact sheet")
     sheet.add_argument("--out", type=Path, required=True)
-    sheet.add_argument("--scenes", type=int, default=8)
-    sheet.add_argument("--first-seed", type=int, default=0)
+    sheet.add_argument("--scenes", type=number(1, 10**7), default=8)
+    sheet.add_argument("--first-seed", type=number(), default=0)
     sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
     bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
     for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
-        command.add_argument("--frames", type=int, default=frames)
-        command.add_argument("--height", type=int, default=64)
-        command.add_argument("--width", type=int, default=112)
+        command.add_argument("--frames", type=number(1), default=frames)
+        command.add_argument("--height", type=number(1), default=64)
+        command.add_argument("--width", type=number(1), default=112)
     for command in (pool, bench):
-        command.add_argument("--supersample", type=int, default=2)
-    args = parser.parse_args(arguments)
-    try:
-        _run(args)
-    except UserError as error:
-        print(error, file=sys.stderr)
-        sys.exit(2)
+        command.add_argument("--supersample", type=number(1), default=2)
+    for command in (pool, sheet, bench):
+        command.add_argument("--debug", action="store_true", help="show tracebacks")
+    return execute(_run, parser, arguments)
 
 
 def _run(args: argparse.Namespace) -> None:

@@ -325,4 +325,4 @@ def _device_textures(split: str) -> Array:
 if __name__ == "__main__":
     from roge_jax.data.pool import main
 
-    main()
+    raise SystemExit(main())

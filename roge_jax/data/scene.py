@@ -19,7 +19,7 @@ from roge_jax.data.images import (
 )
 from roge_jax.data.readers import read_frames
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.fields import number
+from roge_jax.fields import exists, number
 from roge_jax.geometry.cameras import (
     Cameras,
     CameraWarning,
@@ -110,18 +110,11 @@ def open_scene(
         raise UserError(f"exif='{exif}': {did_you_mean(exif, ('auto', 'ignore'))}")
     if not 0 <= background <= 1:
         raise UserError(f"background={background}: give a grey from 0 (black) to 1 (white).")
-    if not name or (not _exists(Path(spec)) and "/" not in name and "." not in name):
+    if not name or (not exists(Path(spec)) and "/" not in name and "." not in name):
         hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
         raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
     found = read_frames(Path(spec), convention=convention, camera=camera)
     return _assemble(found, name, exif, background)
-
-
-def _exists(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):  # a name that no file can have
-        return False
 
 
 def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:

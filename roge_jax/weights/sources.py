@@ -154,8 +154,11 @@ def open_source(path: str | Path) -> Source:
 
 def read_safetensors_header(file: Path) -> dict[str, Stored]:
     """{key: place} of a safetensors file, checked against the size of the file."""
-    size = file.stat().st_size
-    with file.open("rb") as f:
+    try:
+        size, stream = file.stat().st_size, file.open("rb")
+    except OSError as error:
+        raise UserError(f"{file} cannot be read ({error.strerror}): copy it again.") from None
+    with stream as f:
         start = f.read(8)
         length = int.from_bytes(start, "little") if len(start) == 8 else HEADER_LIMIT + 1
         if length > HEADER_LIMIT:
@@ -170,7 +173,7 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
             header = json.loads(f.read(length))
             header.pop("__metadata__", None)
             tensors = {key: _stored(file, 8 + length, key, entry) for key, entry in header.items()}
-        except (ValueError, AttributeError, KeyError, TypeError) as error:
+        except (ValueError, AttributeError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, UserError):
                 raise
             raise UserError(
