@@ -1,12 +1,15 @@
 """Output folders that are whole or absent, and that one run at a time writes."""
 
 import contextlib
+import json
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from .errors import UserError
+from .fields import is_file, read_json
 
 RECORD = "run.json"  # what marks a folder as that of an earlier run
 
@@ -68,6 +71,32 @@ def output_file(file: Path, option: str, *suffixes: str) -> Path:
             f"{option} {_shown(file)} cannot be written ({problem}): give another file."
         )
     return file
+
+
+def keep_settings(folder: Path, settings: dict[str, Any], *, begun: bool, resume: bool) -> None:
+    """Write what a run in `folder` was started with, or hold a run that continues it (`resume`) against that.
+
+    `begun`: whether the folder has something to continue. Raises: UserError naming the setting that differs. Runs
+    without the file (settings.json) pass.
+    """
+    file = Path(folder) / "settings.json"
+    if begun:
+        before = read_json(file, "settings of the run") if resume and is_file(file) else settings
+        if not isinstance(before, dict):
+            raise UserError(
+                f"{file} holds no settings of a run: delete it to continue without this check."
+            )
+        for name, value in settings.items():
+            if name in before and before[name] != value:
+                raise UserError(
+                    f"{folder} holds a run with {name} {before[name]}, and {value} is asked for: continue it with the "
+                    "same, or choose another --out."
+                )
+        return
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_suffix(".json.part")
+    temporary.write_text(json.dumps(settings, indent=1) + "\n")
+    temporary.replace(file)
 
 
 def _resolved(out: Path) -> Path:

@@ -5,8 +5,8 @@
     python -m roge_jax.train mini --stage recon --init runs/mini/recon_low/model  one stage from any model folder
     python -m roge_jax.train tiny --steps 20               seconds, random weights
 
-Each stage writes OUT/STAGE: log.jsonl, checkpoints/ (resumable with --resume) and model/ (weights + config to load);
-lora and hires also adapter/ (what they changed, with a model card: see roge_jax.export).
+Each stage writes OUT/STAGE: log.jsonl, settings.json, checkpoints/ (resumable with --resume) and model/ (weights and
+config to load); lora and hires also adapter/ (what they changed, with a model card: see roge_jax.export).
 """
 
 import argparse
@@ -17,6 +17,7 @@ import math
 from pathlib import Path
 
 from .entry import number
+from .folders import keep_settings
 
 RECIPES = ("lora", "hires", "all")
 
@@ -320,6 +321,18 @@ def run_stage(args, stage, params, cfg, mesh=None):
         check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
     working = stages.stage_config(cfg, stage)
+    if distributed.is_main():
+        settings = {
+            "model": cfg.name,
+            "size": f"{working.height}x{working.width}",
+            "batch": stage.batch,
+            "seed": args.seed,
+            "learning rate": stage.optim.learning_rate,
+            "start": Path(starting_point(args)).name,
+            "data": args.data.name if args.data else "procedural scenes",
+        }
+        begun = any((out / "checkpoints").glob("[0-9]*"))
+        keep_settings(out, settings, begun=begun, resume=args.resume)
     if args.data:
         source = read_pool(args.data)
     else:

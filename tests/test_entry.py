@@ -10,7 +10,7 @@ import pytest
 
 from roge_jax import entry
 from roge_jax.errors import UserError
-from roge_jax.folders import output_file, output_folder
+from roge_jax.folders import keep_settings, output_file, output_folder
 
 
 def program(main, *arguments):
@@ -230,6 +230,16 @@ class TestOutputFolder:
         with pytest.raises(UserError, match=r"^--sheet "):
             output_file(tmp_path / name, "--sheet", ".png")
         assert output_file(tmp_path / "new" / "x.png", "--sheet", ".png").parent.is_dir()
+
+    def test_a_run_is_continued_with_its_own_settings(self, tmp_path):
+        keep_settings(tmp_path, {"seed": 1}, begun=False, resume=True)
+        keep_settings(tmp_path, {"seed": 1, "new": 3}, begun=True, resume=True)
+        keep_settings(tmp_path, {"seed": 2}, begun=True, resume=False)  # refused elsewhere
+        with pytest.raises(UserError, match="holds a run with seed 1, and 2 is asked for"):
+            keep_settings(tmp_path, {"seed": 2}, begun=True, resume=True)
+        assert json.loads((tmp_path / "settings.json").read_text()) == {"seed": 1}
+        keep_settings(tmp_path, {"seed": 2}, begun=False, resume=False)
+        assert json.loads((tmp_path / "settings.json").read_text()) == {"seed": 2}
 
     def test_foreign_folders_and_files_are_not_touched(self, tmp_path):
         (tmp_path / "thesis.tex").write_text("precious")

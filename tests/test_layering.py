@@ -18,7 +18,7 @@ ALLOWED = {
     "errors": set(),
     "lazy": set(),
     "fields": {"errors"},
-    "folders": {"errors"},
+    "folders": {"errors", "fields"},
     "core": _GROUND,  # knows nothing of RoGe
     "geometry": _GROUND,
     "config": _GROUND,

@@ -49,6 +49,9 @@ def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
     assert not any("lora" in path for path in flatten(params))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(params))
 
+    for words in (["--seed", 1], ["--batch", 2], ["--lr", 0.5]):
+        with pytest.raises(UserError, match=r"holds a run with .*: continue it with the same"):
+            run(*common, "--steps", 4, "--out", tmp_path, "--resume", *words)
     for step in (3, 4):  # as if the run had died after step 2
         shutil.rmtree(tmp_path / "lora/checkpoints" / str(step))
     run(*common, "--steps", 4, "--out", tmp_path, "--resume")

@@ -167,8 +167,11 @@ def _is_complete(stem: Path, seeds: np.ndarray) -> bool:
     cameras = stem.with_suffix(".npz")
     if not cameras.exists():
         return False
-    with np.load(cameras) as stored:
-        return np.array_equal(stored["seeds"], seeds)
+    try:
+        with cameras.open("rb") as file, np.load(file) as stored:
+            return np.array_equal(stored["seeds"], seeds)
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile):
+        return False  # damaged: rendered again
 
 
 def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
