@@ -46,3 +46,13 @@ def test_mistakes_are_named(scene, tmp_path, capsys):
     (tmp_path / "full" / "mine.txt").touch()
     assert main([str(scene), "--out", str(tmp_path / "full"), "--frames", "4"]) == 2
     assert "full is not empty: give a new folder." in capsys.readouterr().err
+
+
+def test_a_scene_that_fails_leaves_nothing(scene, tmp_path, capsys):
+    """The first scene is written before the second turns out to be missing."""
+    words = [str(scene), str(tmp_path / "gone"), "--out", str(tmp_path / "p"), "--frames", "4"]
+    assert main(words) == 2
+    assert "gone: there is no such scene" in capsys.readouterr().err
+    assert not list(tmp_path.glob("p*"))
+    assert main([str(scene), "--out", str(tmp_path / "p"), "--frames", "0"]) == 2
+    assert "'0' is not a whole number of at least 1" in capsys.readouterr().err

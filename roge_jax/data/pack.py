@@ -10,6 +10,7 @@ normalises every sample by itself. Each scene is one shard, written under tempor
 
 import argparse
 import json
+import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from roge_jax.data.scene import Scene, load_scene, prepare
+from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
 
 
@@ -73,12 +75,31 @@ def pack(
         raise UserError(f"{frames} frames of {height}x{width} are nothing: give numbers above 0.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"{out} is not empty: give a new folder.")
-    out.mkdir(parents=True, exist_ok=True)
+    part = out.with_name(out.name + ".part")
+    shutil.rmtree(part, ignore_errors=True)
+    part.mkdir(parents=True)
+    try:
+        total = _pack_into(part, scenes, frames, height, width, convention)
+    except BaseException:  # one scene that cannot be read: nothing half-written stays
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    part.rename(out)
+    return total
+
+
+def _pack_into(
+    out: Path,
+    scenes: Sequence[str | Path],
+    frames: int,
+    height: int,
+    width: int,
+    convention: str | None,
+) -> int:
     size = {"frames": frames, "height": height, "width": width}
     found, total = [], 0
-    for number, spec in enumerate(scenes):
+    for index, spec in enumerate(scenes):
         scene = load_scene(spec, convention=convention)
-        count = pack_scene(scene, out / f"shard_{number:05d}", **size)
+        count = pack_scene(scene, out / f"shard_{index:05d}", **size)
         total += count
         found.append({"scene": str(spec), "views": len(scene), "sequences": count})
         print(f"{spec}: {len(scene)} views, {count} sequences", flush=True)
@@ -95,17 +116,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     p.add_argument("scenes", nargs="+", help="scene folders or files")
     p.add_argument("--out", type=Path, required=True, help="new folder, for train --data")
-    p.add_argument("--frames", type=int, default=24, help="views of a sequence (default: 24)")
-    p.add_argument("--height", type=int, default=64, help="of the model to train (default: 64)")
-    p.add_argument("--width", type=int, default=112, help="of the model to train (default: 112)")
+    p.add_argument("--frames", type=number(1), default=24, help="views of a sequence (default: 24)")
+    p.add_argument(
+        "--height", type=number(1), default=64, help="of the model to train (default: 64)"
+    )
+    p.add_argument(
+        "--width", type=number(1), default=112, help="of the model to train (default: 112)"
+    )
     p.add_argument("--convention", help="axes of a transforms.json that are not OpenGL")
-    args = p.parse_args(arguments)
-    try:
-        pack(**vars(args))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    p.add_argument("--debug", action="store_true", help="show tracebacks")
+
+    def run(args: argparse.Namespace) -> None:
+        options = dict(vars(args))
+        options.pop("debug")
+        pack(**options)
+
+    return execute(run, p, arguments)
 
 
 if __name__ == "__main__":
