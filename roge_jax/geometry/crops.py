@@ -82,7 +82,10 @@ def resize(image: np.ndarray, height: int, width: int) -> np.ndarray:
         return np.asarray(jax.image.resize(image, shape, "linear", antialias=True))
     shrinks = height < image.shape[0] or width < image.shape[1]
     flag = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    resized = cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=flag)
+    try:
+        resized = cv2.resize(np.ascontiguousarray(image), (width, height), interpolation=flag)
+    except cv2.error as error:
+        raise MemoryError(f"no picture of {width} x {height} pixels could be made") from error
     return resized.reshape(height, width, image.shape[2])
 
 
