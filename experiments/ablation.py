@@ -35,7 +35,7 @@ from roge_jax import checkpoint
 from roge_jax.config import preset
 from roge_jax.core.params import Tree, flatten
 from roge_jax.data.pool import read_pool
-from roge_jax.train import ProceduralSource
+from roge_jax.data.source import ProceduralSource
 
 OUT = Path(__file__).resolve().parent / "results"
 

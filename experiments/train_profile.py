@@ -43,8 +43,8 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
     from roge_jax.checkpoint import load_model
     from roge_jax.core.lora import attach
     from roge_jax.core.params import count, init
+    from roge_jax.data.source import ProceduralSource
     from roge_jax.entry import environment
-    from roge_jax.train import ProceduralSource
     from roge_jax.training import loop, stages
     from roge_jax.training.optim import make_optimiser
 

@@ -122,28 +122,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-class ProceduralSource:
-    """Endless sequences rendered when they are asked for; item i is scene seed i of the training split."""
-
-    def __init__(self, height: int, width: int, frames: int):
-        self.height, self.width, self.frames = height, width, frames
-
-    def __len__(self) -> int:
-        return 10**9  # held-out seeds begin here
-
-    def __getitem__(self, index: int) -> dict:
-        from .data.procedural import sample_sequence
-
-        return sample_sequence(
-            index,
-            height=self.height,
-            width=self.width,
-            frames=self.frames,
-            depth=False,
-            varied=True,
-        )
-
-
 def main(args: argparse.Namespace) -> None:
     from .core import distributed, sharding
 
@@ -159,6 +137,7 @@ def main(args: argparse.Namespace) -> None:
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
     from . import checkpoint, config
+    from .errors import UserError
 
     preset, init = config.preset(args.preset), starting_point(args)
     with on_host():
@@ -168,6 +147,11 @@ def main(args: argparse.Namespace) -> None:
             params, cfg = model.init(jax.random.key(args.seed), preset), preset
         else:
             params, cfg = checkpoint.load_model(init)
+    if cfg.name != preset.name and cfg.name in config.PRESETS:
+        raise UserError(
+            f"--init {init} is a '{cfg.name}' model and the preset is '{preset.name}': the model's own sizes count, so "
+            f"write `train {cfg.name} --init {init}`."
+        )
     cfg, chosen = choose(args, cfg)
     for stage in chosen:
         params, cfg = run_stage(args, stage, params, cfg, mesh)
@@ -309,7 +293,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
     from .core.params import count, flatten, unflatten
     from .core.params import init as init_specs
     from .cost import keeps_float32
-    from .data.pool import read_pool
+    from .data.source import open_source
     from .training import loop, stages
 
     out = args.out / stage.name
@@ -333,10 +317,10 @@ def run_stage(args, stage, params, cfg, mesh=None):
         }
         begun = any((out / "checkpoints").glob("[0-9]*"))
         keep_settings(out, settings, begun=begun, resume=args.resume)
-    if args.data:
-        source = read_pool(args.data)
-    else:
-        source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
+    size = working.height, working.width
+    window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
+    source = open_source(args.data, *size, window)
+    stage = dataclasses.replace(stage, views=dataclasses.replace(stage.views, size=size))
     trainable, frozen = model.split(params, stage.trains)
     specs, frozen_specs = stages.stage_specs(cfg, stage)
     if stage.lora:

@@ -15,7 +15,7 @@ from roge_jax import model
 from roge_jax.config import preset
 from roge_jax.core.layers import patch_conv
 from roge_jax.core.params import abstract, flatten, init
-from roge_jax.train import ProceduralSource
+from roge_jax.data.source import ProceduralSource
 
 TINY = preset("tiny")
 VARIANTS = reconstruction.VARIANTS

@@ -13,6 +13,7 @@ from test_sharding import small
 from roge_jax import config, entry, model, train
 from roge_jax.checkpoint import load_model
 from roge_jax.core.params import flatten
+from roge_jax.data.source import open_source
 from roge_jax.errors import UserError
 from roge_jax.training import stages
 
@@ -102,3 +103,21 @@ def test_a_stage_gets_what_its_objective_reads():
     batch = {"target_rgb": jax.ShapeDtypeStruct((1, 5, 16, 16, 3), np.float32)}
     objective = functools.partial(stages.vae_objective, config=cfg, stage=decoder)
     jax.eval_shape(objective, trained, stages.read(frozen, decoder), batch, jax.random.key(0))
+
+
+def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):
+    rgb = np.zeros((1, 6, 32, 64, 3), np.uint8)
+    np.save(tmp_path / "shard_00000.rgb.npy", rgb)
+    poses = np.broadcast_to(np.eye(4), (1, 6, 4, 4))
+    np.savez(tmp_path / "shard_00000.npz", seeds=[0], K=poses[..., :3, :3], c2w=poses)
+    assert len(open_source(tmp_path, 32, 64, 6)) == len(open_source(tmp_path, 16, 32, 1)) == 1
+    for size in ((32, 48), (64, 128), (16, 64)):
+        with pytest.raises(UserError, match=f"32x64 and this stage trains at {size[0]}x{size[1]}"):
+            open_source(tmp_path, *size, 6)
+    with pytest.raises(UserError, match=r"6 frames .* windows of 7"):
+        open_source(tmp_path, 32, 64, 7)
+
+
+def test_the_preset_must_be_that_of_the_model(tmp_path):
+    with pytest.raises(UserError, match="'mini' model and the preset is 'tiny'"):
+        run("tiny", "--init", "mini", "--devices", 1, "--out", tmp_path)

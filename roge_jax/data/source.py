@@ -1,0 +1,52 @@
+"""Where training sequences come from: a pool on disk, or procedural scenes rendered when they are asked for."""
+
+from pathlib import Path
+
+from ..errors import UserError
+from .pool import read_pool
+
+
+class ProceduralSource:
+    """Endless sequences of `frames` varied views [height, width]; item i is scene seed i of the training split."""
+
+    def __init__(self, height: int, width: int, frames: int):
+        self.height, self.width, self.frames = height, width, frames
+
+    def __len__(self) -> int:
+        return 10**9  # held-out seeds begin here
+
+    def __getitem__(self, index: int) -> dict:
+        from .procedural import sample_sequence
+
+        return sample_sequence(
+            index,
+            height=self.height,
+            width=self.width,
+            frames=self.frames,
+            depth=False,
+            varied=True,
+        )
+
+
+def open_source(folder: Path | None, height: int, width: int, window: int):
+    """Sequences to draw training samples of `window` targets at height x width from: the pool in `folder`, or
+    procedural ones.
+
+    Raises:
+        UserError: the pool's frames are not that size or a whole multiple of it, or are fewer than the window.
+    """
+    if folder is None:
+        return ProceduralSource(height, width, frames=max(24, window + 3))
+    pool = read_pool(folder)
+    frames, h, w = pool[0]["rgb"].shape[:3]
+    if h % height or w % width or h // height != w // width:
+        raise UserError(
+            f"{folder}: its frames are {h}x{w} and this stage trains at {height}x{width}: give a pool of that size or "
+            f"of a whole multiple of it, or another --size."
+        )
+    if frames < window:
+        raise UserError(
+            f"{folder}: its sequences have {frames} frames and this stage trains on windows of {window}: render or "
+            f"pack longer ones with --frames."
+        )
+    return pool
