@@ -62,7 +62,7 @@ def wait(processes, out: Path, seconds: float = 300.0) -> list[int]:
 
 def losses(out: Path) -> dict[int, float]:
     rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return {row["step"]: row["loss"] for row in rows}
+    return {row["step"]: row["loss"] for row in rows if "loss" in row}
 
 
 def text(out: Path, count: int) -> str:
