@@ -54,7 +54,7 @@ def train(
         loss = jnp.square(y + trainable["out"]["bias"][None] - batch["y"]).mean()
         return loss, {}
 
-    done = 0
+    done = -1  # the first evaluation comes before the first step
 
     def evaluate(params):
         nonlocal done
