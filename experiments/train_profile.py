@@ -49,7 +49,7 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
     from roge_jax.training.optim import make_optimiser
 
     params, config = load_model(checkpoint)
-    stage = stages.lora_stage(200, frames=config.frames)
+    stage = stages.for_one_scene(stages.lora_stage(200, frames=config.frames))
     working = stages.stage_config(config, stage)
     source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
     draw = functools.partial(stages.stage_batch, source, stage, working, seed)
