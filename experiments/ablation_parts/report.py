@@ -205,7 +205,7 @@ def _conditions(ax, row: dict) -> None:
     count = len(row["errors"]["all conditions"])
     ax.set_title(f"a condition taken away at test time (n = {count})", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.legend(fontsize=7, ncols=2, loc="center", bbox_to_anchor=(0.5, 0.6))
+    ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
 
 
 def _finetune(ax, row: dict) -> None:
