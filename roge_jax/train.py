@@ -19,8 +19,6 @@ from pathlib import Path
 from .entry import number
 from .folders import keep_settings
 
-RECIPES = ("lora", "hires", "all")
-
 
 def parser() -> argparse.ArgumentParser:
     p = argparse.ArgumentParser(
@@ -137,7 +135,6 @@ def main(args: argparse.Namespace) -> None:
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
     from . import checkpoint, config
-    from .errors import UserError
 
     preset, init = config.preset(args.preset), starting_point(args)
     with on_host():
@@ -147,11 +144,7 @@ def main(args: argparse.Namespace) -> None:
             params, cfg = model.init(jax.random.key(args.seed), preset), preset
         else:
             params, cfg = checkpoint.load_model(init)
-    if cfg.name != preset.name and cfg.name in config.PRESETS:
-        raise UserError(
-            f"--init {init} is a '{cfg.name}' model and the preset is '{preset.name}': the model's own sizes count, so "
-            f"write `train {cfg.name} --init {init}`."
-        )
+    check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
     for stage in chosen:
         params, cfg = run_stage(args, stage, params, cfg, mesh)
@@ -159,6 +152,18 @@ def main(args: argparse.Namespace) -> None:
 
 def starting_point(args: argparse.Namespace) -> str:
     return args.init or ("mini" if args.preset == "mini" and args.stage != "all" else "scratch")
+
+
+def check_preset(preset, cfg, init: str) -> None:
+    """Raise UserError if the model to start from is that of another preset: its sizes would silently win."""
+    from .config import PRESETS
+    from .errors import UserError
+
+    if cfg.name != preset.name and cfg.name in PRESETS:
+        raise UserError(
+            f"--init {init} is a '{cfg.name}' model and the preset is '{preset.name}': the model's own sizes count, so "
+            f"write `train {cfg.name} --init {init}`."
+        )
 
 
 def choose(args: argparse.Namespace, cfg):
@@ -202,7 +207,8 @@ def dry_run(args: argparse.Namespace) -> str:
     init = starting_point(args)
     cfg = config.preset(args.preset)
     if init != "scratch":
-        cfg = checkpoint.load_config(checkpoint.find_model(init))
+        preset, cfg = cfg, checkpoint.load_config(checkpoint.find_model(init))
+        check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
     large = count(model.specs(cfg)) > plan.LARGE
     dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
@@ -399,7 +405,8 @@ def run_stage(args, stage, params, cfg, mesh=None):
         if stage.lora:
             base = {"base": args.init or args.preset, "data": str(args.data or "procedural scenes")}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance | base)
-    say(f"{stage.name}: saved {out / 'model'}{loop.held_out_change(out / 'log.jsonl')}")
+        change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
+        print(f"{stage.name}: saved {out / 'model'}{change}")
     return params, cfg
 
 

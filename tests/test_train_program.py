@@ -121,3 +121,5 @@ def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):
 def test_the_preset_must_be_that_of_the_model(tmp_path):
     with pytest.raises(UserError, match="'mini' model and the preset is 'tiny'"):
         run("tiny", "--init", "mini", "--devices", 1, "--out", tmp_path)
+    with pytest.raises(UserError, match="'mini' model and the preset is 'tiny'"):
+        run("tiny", "--init", "mini", "--dry-run")

@@ -220,9 +220,9 @@ def measure_latents(
     params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32
 ) -> RoGeConfig:
     """`config` with the mean and standard deviation per latent channel that this VAE has on training clips."""
-    stage = Stage(
-        "", "vae", "", 1, 1, OptimConfig(), ViewConfig(targets=config.frames, ordered=True)
-    )
+    size = config.height, config.width
+    views = ViewConfig(targets=config.frames, ordered=True, size=size)
+    stage = Stage("", "vae", "", 1, 1, OptimConfig(), views)
     encode = jax.jit(functools.partial(vae.encode_moments, cfg=config.vae))
     found = []
     for i in range(clips):
