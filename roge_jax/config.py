@@ -87,6 +87,8 @@ class FusionConfig:
     """Geometry adapter between ray features and latent slots (Sec. 3.2)."""
 
     geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
+    # The targets' appearance: the reconstruction's own frames, encoded, instead of the paper's zeros.
+    preview: bool = False
 
 
 @dataclass(frozen=True)

@@ -282,11 +282,13 @@ def estimate(
     scene_tokens = scene_tokens_read(config, m)
     rays = (size[0] // config.renderer.patch) * (size[1] // config.renderer.patch)
     tokens = tokens_per_slot(config) * slots
+    preview_encode = vae_encode(config.vae, n, config.height, config.width)
     flops = {
         "encode photos (VAE)": m * vae_encode(config.vae, 1, config.height, config.width),
         "reconstruct": encoder(config.encoder, *size, m, config.renderer.width),
         "query rays": renderer(config.renderer, *size, scene_tokens, m, m + n),
         "condition": fusion(config, m + n, slots) + text(config.dit),
+        **({"encode preview (VAE)": preview_encode} if config.fusion.preview else {}),
         "velocity": velocity(config.dit, tokens),
         "decode": vae_decode(config.vae, n, config.height, config.width),
     }
@@ -300,6 +302,7 @@ def estimate(
     refined = r.attention != "cross" and (r.refinement == "per_view" or r.attention == "full")
     features = 4.0 * (m + n) * rays * r.width
     chunked = decoder_tensor_bytes(config) > SINGLE_PASS_BYTES
+    maps = MAPS * decoder_tensor_bytes(config, 4 if chunked else n)
     working = {
         "encode photos (VAE)": MAPS * decoder_tensor_bytes(config, m),
         "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
@@ -307,10 +310,11 @@ def estimate(
         + scores(chunk * ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
+        **({"encode preview (VAE)": features + maps} if config.fusion.preview else {}),
         "velocity": features
         + scores(tokens, tokens, d.heads)
         + 4.0 * tokens * (6 * d.width + d.ffn),
-        "decode": MAPS * decoder_tensor_bytes(config, 4 if chunked else n),
+        "decode": maps,
     }
     counts = {
         "scene tokens": scene_tokens,

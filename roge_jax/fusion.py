@@ -20,8 +20,8 @@ MASK_CHANNELS = 4
 class Condition(NamedTuple):
     """What the transformer knows besides the noisy latents: the same at every noise level.
 
-    appearance: [t, lh, lw, 20] = [mask 4, context latents or zeros 16]; tokens: [l, d], the sum of the embedded rays
-    and ray features.
+    appearance: [t, lh, lw, 20] = [mask 4, context latents or, on targets, zeros or those of a preview 16];
+    tokens: [l, d], the sum of the embedded rays and ray features.
     """
 
     appearance: jax.Array
@@ -38,12 +38,19 @@ def fusion_specs(config: RoGeConfig) -> Tree:
     }
 
 
-def appearance(context_latents: jax.Array, slots: int) -> jax.Array:
-    """Y = [B; [X^S, 0^T]]: context latents [m, lh, lw, 16] -> [slots, lh, lw, 20], mask channels first."""
+def appearance(
+    context_latents: jax.Array, slots: int, preview: jax.Array | None = None
+) -> jax.Array:
+    """Y = [B; [X^S, 0^T]]: context latents [m, lh, lw, 16] -> [slots, lh, lw, 20], mask channels first.
+
+    `preview` [slots - m, lh, lw, 16]: latents that stand in place of 0^T. The mask B is 0 there all the same: they are
+    a guess, photos are the truth.
+    """
     m, lh, lw, c = context_latents.shape
-    mask = jnp.ones((m, lh, lw, MASK_CHANNELS))
-    known = jnp.concatenate([mask, context_latents], -1)
-    return jnp.concatenate([known, jnp.zeros((slots - m, lh, lw, MASK_CHANNELS + c))])
+    guess = jnp.zeros((slots - m, lh, lw, c)) if preview is None else preview
+    mask = jnp.arange(slots)[:, None, None, None] < m
+    mask = jnp.broadcast_to(mask, (slots, lh, lw, MASK_CHANNELS)).astype(context_latents.dtype)
+    return jnp.concatenate([mask, jnp.concatenate([context_latents, guess])], -1)
 
 
 def ray_condition(plucker: jax.Array, contexts: int) -> jax.Array:
@@ -67,15 +74,21 @@ def geometry_condition(p: Tree, features: jax.Array, latent_size: tuple[int, int
 
 
 def condition(
-    p: Tree, context_latents: jax.Array, plucker: jax.Array, features: jax.Array, contexts: int
+    p: Tree,
+    context_latents: jax.Array,
+    plucker: jax.Array,
+    features: jax.Array,
+    preview: jax.Array | None = None,
 ) -> Condition:
-    """All of C = {Y, P, G}; plucker [m + n, h, w, 6] at generation size, features [m + n, gh, gw, d]."""
+    """All of C = {Y, P, G}; plucker [m + n, h, w, 6] at generation size, features [m + n, gh, gw, d], `preview` as in
+    `appearance`."""
+    contexts = context_latents.shape[0]
     rays = ray_condition(plucker, contexts)
     lh, lw = rays.shape[1:3]
     geometry = geometry_condition(p, features, (lh, lw), contexts)
     tokens = patch_conv(p["rays_embed"], rays) + patch_conv(p["geometry_embed"], geometry)
     return Condition(
-        appearance(context_latents, rays.shape[0]), tokens.reshape(-1, tokens.shape[-1])
+        appearance(context_latents, rays.shape[0], preview), tokens.reshape(-1, tokens.shape[-1])
     )
 
 

@@ -182,6 +182,20 @@ def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax
     return jnp.clip(0.5 + 0.5 * vae.decode(params["vae"], latents, cfg=config.vae), 0.0, 1.0)
 
 
+def preview_latents(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array | None:
+    """The RGB head's frames of the targets' ray features [n, gh, gw, d], encoded [1 + (n - 1) / 4, lh, lw, 16]; None
+    unless the model has `FusionConfig.preview`.
+
+    Not in the paper. A large pretrained transformer can learn to turn ray features into latents; a small one spends its
+    training on becoming a second encoder. No gradient passes: the features learn through G and the photometric term.
+    """
+    if not config.fusion.preview:
+        return None
+    frames = decode_rgb(params, jax.lax.stop_gradient(features), config=config)
+    frames = resized(frames, config.height, config.width)
+    return jax.lax.stop_gradient(encode_targets(params, frames, config=config))
+
+
 @jax.named_scope("condition")
 def condition(
     params: Tree,
@@ -191,10 +205,10 @@ def condition(
     *,
     config: RoGeConfig,
 ) -> Condition:
-    """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views."""
-    m = context_latents.shape[0]
+    """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views, contexts first."""
+    preview = preview_latents(params, features[context_latents.shape[0] :], config=config)
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
-    return fusion.condition(params["fusion"], context_latents, rays, features, m)
+    return fusion.condition(params["fusion"], context_latents, rays, features, preview)
 
 
 def unconditioned(context_latents: jax.Array, slots: int, *, config: RoGeConfig) -> Condition:

@@ -216,6 +216,14 @@ class TestEstimate:
         assert SCORES_BYTES < 4 * 6804**2 * 40, "queries in pieces"
         assert plain - fused == SCORES_BYTES
 
+    def test_a_preview_costs_one_more_encoding(self):
+        plain = preset("tiny")
+        config = dataclasses.replace(plain, fusion=dataclasses.replace(plain.fusion, preview=True))
+        with_, without = cost.estimate(config, 2, 8), cost.estimate(plain, 2, 8)
+        more = cost.vae_encode(plain.vae, plain.frames, plain.height, plain.width)
+        assert with_.total_flops == pytest.approx(without.total_flops + more)
+        assert with_.working_bytes.keys() == with_.flops.keys()
+
     def test_working_memory_is_what_xla_allocates_within_a_factor_of_two(self):
         """Of the two stages that decide the peak, at a size where the named tensors outweigh small buffers."""
         size = {"height": 96, "width": 160, "recon_height": 96, "recon_width": 160}

@@ -227,7 +227,12 @@ def test_permuting_context_slots_permutes_their_outputs_and_leaves_the_targets()
     assert rel_l2(run(targets), plain[targets]) > 1e-2  # targets have an order
 
 
-def test_permuting_context_views_permutes_their_conditions():
+# A model that shows its transformer what the reconstruction alone would have shown.
+PREVIEW = dataclasses.replace(CONFIG, fusion=dataclasses.replace(CONFIG.fusion, preview=True))
+
+
+@pytest.mark.parametrize("config", [CONFIG, PREVIEW], ids=["zeros", "preview"])
+def test_permuting_context_views_permutes_their_conditions(config):
     rng = np.random.default_rng(2)
     order = np.asarray([1, 0, *range(M, M + N)])
     slots = np.asarray([1, 0, *range(M, SLOTS)])
@@ -238,12 +243,60 @@ def test_permuting_context_views_permutes_their_conditions():
 
     def run(order):
         turned = views | {k: views[k][order] for k in ("K", "c2w")}
-        return model.condition(whole(), known[order[:M]], features[order], turned, config=CONFIG)
+        return model.condition(whole(), known[order[:M]], features[order], turned, config=config)
 
     plain, turned = run(np.arange(M + N)), run(order)
     np.testing.assert_array_equal(turned.appearance, plain.appearance[slots])
     tokens = plain.tokens.reshape(SLOTS, -1, CONFIG.dit.width)
     assert rel_l2(turned.tokens.reshape(tokens.shape), tokens[slots]) < ROUNDING
+
+
+def made_condition(config):
+    """(known latents, ray features, views) of a scene, random."""
+    rng = np.random.default_rng(4)
+    grid = (config.recon_height // 8, config.recon_width // 8)
+    features = rng.standard_normal((M + N, *grid, config.renderer.width))
+    known = rng.standard_normal((M, *config.latent_size, 16))
+    views = {k: jnp.asarray(v) for k, v in sample(4).items()}
+    return jnp.asarray(known, jnp.float32), jnp.asarray(features, jnp.float32), views
+
+
+@pytest.mark.parametrize("shrink", [1, 2], ids=["same size", "half size"])
+def test_the_preview_stands_where_the_targets_have_zeros(shrink):
+    config = dataclasses.replace(
+        PREVIEW,
+        recon_height=PREVIEW.recon_height // shrink,
+        recon_width=-(-PREVIEW.recon_width // shrink // 8) * 8,
+    )
+    known, features, views = made_condition(config)
+    cond = model.condition(whole(), known, features, views, config=config)
+    frames = model.decode_rgb(whole(), features[M:], config=config)
+    if shrink > 1:
+        frames = jax.image.resize(frames, (N, config.height, config.width, 3), "bilinear")
+    latents = model.encode_targets(whole(), frames, config=config)
+    assert np.any(latents)
+    np.testing.assert_allclose(cond.appearance[M:, ..., 4:], latents, rtol=1e-4, atol=1e-5)
+    np.testing.assert_array_equal(cond.appearance[:M, ..., 4:], known)
+    seen = np.broadcast_to(
+        np.arange(SLOTS)[:, None, None, None] < M, (SLOTS, *config.latent_size, 4)
+    )
+    np.testing.assert_array_equal(cond.appearance[..., :4], seen)
+    plain = dataclasses.replace(config, fusion=CONFIG.fusion)
+    without = model.condition(whole(), known, features, views, config=plain)
+    assert not np.any(without.appearance[M:])
+    np.testing.assert_array_equal(cond.tokens, without.tokens)
+
+
+def test_no_gradient_passes_through_the_preview():
+    known, features, views = made_condition(PREVIEW)
+
+    def shown(p, features):
+        return jnp.square(
+            model.condition(p, known, features, views, config=PREVIEW).appearance
+        ).sum()
+
+    for leaf in jax.tree.leaves(jax.jit(jax.grad(shown, argnums=(0, 1)))(whole(), features)):
+        assert not np.any(leaf)
 
 
 # Step 0.
