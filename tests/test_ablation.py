@@ -142,11 +142,14 @@ def test_hidden_rays_change_nothing():
     np.testing.assert_allclose(embed(blind, one), embed(params, shared), atol=1e-5)
 
 
-def test_altered_conditions_are_those_named():
+@pytest.mark.parametrize("preview", [False, True])
+def test_altered_conditions_are_those_named(preview):
     rng = np.random.default_rng(0)
     shapes = {"x0": (3, 5, 4, 4, 2), "rays": (3, 6, 8), "features": (3, 6, 4)}
+    shapes |= {"preview": (3, 3, 4, 4, 2)} if preview else {}
     clips = {n: rng.standard_normal(s) for n, s in shapes.items()}
     clips |= {"known": clips["x0"][:, :2], "seen": clips["x0"][:, :2]}
+    assert len(generator.altered(clips)) == (11 if preview else 7)
     for name, case in generator.altered(clips).items():
         assert case["x0"] is clips["x0"]  # the truth that is asked for never changes
         changed = {n for n in clips if not np.array_equal(case[n], clips[n])}
@@ -155,7 +158,8 @@ def test_altered_conditions_are_those_named():
             "all conditions": set(),
             "rays": {"rays"},
             "ray features": {"features"},
-            "rays and ray features": {"rays", "features"},
+            "preview": {"preview"},
+            "ray features and preview": {"features", "preview"},
             "context latents": {"known", "seen"},
         }[what]
         assert changed == want

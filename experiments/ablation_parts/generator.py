@@ -22,11 +22,20 @@ from roge_jax.video import flow
 from .common import CONTEXTS, SIGMAS, Clock, heldout
 
 RANKS = (0, 1, 2, 4, 8, 16, 32)
-FINETUNES = {  # gates of (rays, ray features) at the transformer
-    "both conditions": (1.0, 1.0),
-    "without rays": (0.0, 1.0),
-    "without ray features": (1.0, 0.0),
-    "without both": (0.0, 0.0),
+# What the transformer is told, by the names of `encoded`; a model without preview has no such entry.
+TOLD = {
+    "rays": ("rays",),
+    "ray features": ("features",),
+    "preview": ("preview",),
+    "ray features and preview": ("features", "preview"),
+    "context latents": ("known", "seen"),
+}
+FINETUNES = {  # what is zero while the transformer trains on
+    "all conditions": (),
+    "without rays": TOLD["rays"],
+    "without ray features": TOLD["ray features"],
+    "without preview": TOLD["preview"],
+    "without ray features and preview": TOLD["ray features and preview"],
 }
 
 
@@ -39,17 +48,20 @@ def video_stage(config: RoGeConfig, **changes) -> stages.Stage:
 
 @functools.partial(jax.jit, static_argnames="config")
 def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
-    """What no noise level changes: latents of all slots, rays at generation size, ray features."""
+    """What no noise level changes: latents of all slots, rays at generation size, ray features, latents of the preview."""
     tokens = model.reconstruct(params, views, config=config)
     latents = [
         model.encode_contexts(params, views["context_rgb"], config=config),
         model.encode_targets(params, views["target_rgb"], config=config),
     ]
-    return {
+    features = model.query_rays(params, tokens, views, config=config)
+    found = {
         "x0": jnp.concatenate(latents),
         "rays": plucker(views["K"], views["c2w"], config.height, config.width),
-        "features": model.query_rays(params, tokens, views, config=config),
+        "features": features,
     }
+    preview = model.preview_latents(params, features[len(latents[0]) :], config=config)
+    return found if preview is None else found | {"preview": preview}
 
 
 def encode_all(params: Tree, batches, config: RoGeConfig) -> dict[str, np.ndarray]:
@@ -65,7 +77,9 @@ def flow_error(params: Tree, clip, noise, sigma, *, config: RoGeConfig, remat="n
     `known` are the context latents of the appearance condition, `seen` those that are noised in the context slots.
     """
     x0, m = clip["x0"], clip["known"].shape[0]
-    cond = fusion.condition(params["fusion"], clip["known"], clip["rays"], clip["features"], m)
+    cond = fusion.condition(
+        params["fusion"], clip["known"], clip["rays"], clip["features"], clip.get("preview")
+    )
     x = flow.x_sigma(jnp.concatenate([clip["seen"], x0[m:]]), noise, sigma)
     v = model.velocity(params, x, sigma, cond, config=config, contexts=m, remat=remat)
     return jnp.square(v - flow.velocity_target(x0, noise))[m:].mean()
@@ -90,12 +104,9 @@ def flow_errors(params: Tree, clips: dict[str, np.ndarray], config: RoGeConfig) 
 def altered(clips: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
     """The clips with one condition zeroed, or taken from the next scene."""
     cases = {"all conditions": {}}
-    for label, names in (
-        ("rays", ("rays",)),
-        ("ray features", ("features",)),
-        ("rays and ray features", ("rays", "features")),
-        ("context latents", ("known", "seen")),
-    ):
+    for label, names in TOLD.items():
+        if not clips.keys() >= set(names):
+            continue
         cases[f"{label}: zero"] = {n: np.zeros_like(clips[n]) for n in names}
         cases[f"{label}: another scene's"] = {n: np.roll(clips[n], 1, 0) for n in names}
     return {label: clips | change for label, change in cases.items()}
@@ -140,18 +151,20 @@ def finetune(
 
     step = jax.jit(loop.make_step(objective, optimiser, optim), donate_argnums=0)
 
-    def gated(arrays, gates):
-        return arrays | {n: arrays[n] * np.float32(g) for n, g in zip(("rays", "features"), gates)}
+    def without(arrays, names):
+        return arrays | {n: np.zeros_like(arrays[n]) for n in names}
 
     result: dict[str, Any] = {"before": {}, "after": {}, "clocks": {}}
-    for name, gates in FINETUNES.items():
+    for name, absent in FINETUNES.items():
+        if not data.keys() >= set(absent):
+            continue
         state = loop.initial_state(jax.tree.map(jnp.copy, trainable), optimiser, optim)
         rng, clock = np.random.default_rng(0), Clock()
         for i in range(steps):
             rows = rng.choice(clips, 4, replace=False)
-            batch = gated({k: v[rows] for k, v in data.items()}, gates)
+            batch = without({k: v[rows] for k, v in data.items()}, absent)
             state, _ = clock.run(step, state, frozen, batch, jax.random.key(i))
-        seen = gated(test, gates)
+        seen = without(test, absent)
         result["before"][name] = flow_errors(params, seen, config).tolist()
         learned = attach(frozen, state["ema"])
         result["after"][name] = flow_errors(learned, seen, config).tolist()

@@ -7,7 +7,6 @@ import numpy as np
 from roge_jax.metrics.report import bootstrap
 
 from .common import SIGMAS
-from .generator import FINETUNES
 from .reconstruction import VARIANTS
 
 
@@ -78,19 +77,19 @@ def tables(rows: dict[str, dict]) -> str:
             lines.append(f"| {name} | {cells} | {rise if name != 'all conditions' else ''} |")
     if "finetune" in rows:
         row = rows["finetune"]
-        whole = np.asarray(row["after"]["both conditions"])
+        whole = np.asarray(row["after"]["all conditions"])
         lines += [
             "",
-            "| trained on | flow error before | after | after, against both [95 %] | core-s |",
+            "| trained on | flow error before | after | after, against all [95 %] | core-s |",
         ]
         lines += ["|---|---|---|---|---|"]
-        for name in FINETUNES:
+        for name in row["after"]:
             before, after = (np.asarray(row[k][name]) for k in ("before", "after"))
             d = bootstrap((after - whole).mean(1))
             more = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
             lines.append(
                 f"| {name} | {before.mean():.3f} | {after.mean():.3f} | "
-                f"{more if name != 'both conditions' else ''} | {row['clocks'][name]['core_seconds']:.0f} |"
+                f"{more if name != 'all conditions' else ''} | {row['clocks'][name]['core_seconds']:.0f} |"
             )
     if "lora" in rows:
         row = rows["lora"]
@@ -209,13 +208,13 @@ def _conditions(ax, row: dict) -> None:
 
 
 def _finetune(ax, row: dict) -> None:
-    for k, name in enumerate(FINETUNES):
+    for k, name in enumerate(row["after"]):
         for when, line in (("before", ":"), ("after", "-")):
             errors = np.mean(row[when][name], 0)
             ax.plot(row["sigmas"], errors, color=f"C{k}", ls=line, marker="o", ms=3,
                     label=name if when == "after" else None)  # fmt: skip
     ax.plot([], [], color="0.4", ls=":", label="dotted: before")
-    steps = row["clocks"]["both conditions"]["steps"]
+    steps = row["clocks"]["all conditions"]["steps"]
     ax.set(xlabel="noise level sigma", ylabel="held-out flow error")
     ax.set_title(f"trained on for {steps} steps without it", fontsize=10)
     ax.grid(True, alpha=0.3)
