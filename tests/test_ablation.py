@@ -194,3 +194,13 @@ def test_differences_are_paired_and_judged_against_the_seed():
     table = report.tables(report.ready(rows))
     assert "| good | 1.00 | 3 |" in table and "+1.00 [+1.00, +1.00]" in table
     assert "orphan" not in table
+
+
+def test_the_preview_stands_beside_the_flow_errors():
+    rows = {"base": made_up([10.0, 20.0], "seed"), "base, seed 1": made_up([10.0, 20.5], "seed")}
+    errors = {"all conditions": np.full((2, 6), 0.5), "preview: zero": np.full((2, 6), 0.75)}
+    row = {"group": "conditions", "errors": {n: e.tolist() for n, e in errors.items()}}
+    with_preview = report.tables(rows | {"conditions": row | {"preview_itself": [0.1, 0.3]}})
+    assert "taken for x0: 0.200." in with_preview
+    assert "+0.250 [+0.250, +0.250]" in with_preview
+    assert "taken for x0" not in report.tables(rows | {"conditions": row})

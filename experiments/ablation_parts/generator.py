@@ -115,11 +115,15 @@ def altered(clips: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
 def conditions(params: Tree, config: RoGeConfig, scenes: int = 16) -> dict:
     clips = encode_all(params, heldout(video_stage(config), config, scenes), config)
     found = {name: flow_errors(params, case, config) for name, case in altered(clips).items()}
-    return {
+    row = {
         "group": "conditions",
         "sigmas": SIGMAS,
         "errors": {name: e.tolist() for name, e in found.items()},
     }
+    if "preview" in clips:
+        apart = clips["preview"] - clips["x0"][:, CONTEXTS:]
+        row["preview_itself"] = np.square(apart).mean((1, 2, 3, 4)).tolist()
+    return row
 
 
 def finetune(

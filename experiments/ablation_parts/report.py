@@ -75,6 +75,9 @@ def tables(rows: dict[str, dict]) -> str:
             rise = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
             cells = " | ".join(f"{x:.3f}" for x in e.mean(0))
             lines.append(f"| {name} | {cells} | {rise if name != 'all conditions' else ''} |")
+        itself = rows["conditions"].get("preview_itself")
+        if itself:  # at sigma 1 a flow error is that of a guess of x0
+            lines += ["", f"The preview's own latents, taken for x0: {np.mean(itself):.3f}."]
     if "finetune" in rows:
         row = rows["finetune"]
         whole = np.asarray(row["after"]["all conditions"])
