@@ -208,7 +208,7 @@ def sampling_mesh(args: argparse.Namespace):
     """The mesh of --mesh and --devices, None for one device. Call it before anything asks JAX for devices."""
     from .core import distributed, sharding
 
-    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     if sizes.get("data", 1) > 1:
         raise UserError(
             f"--mesh {args.mesh}: one video has no scenes to split over data: use fsdp (weights) and seq (tokens)."

@@ -125,7 +125,7 @@ def main(args: argparse.Namespace) -> None:
 
     if args.dry_run:
         return print(dry_run(args))
-    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
 
@@ -212,7 +212,7 @@ def dry_run(args: argparse.Namespace) -> str:
     cfg, chosen = choose(args, cfg)
     large = count(model.specs(cfg)) > plan.LARGE
     dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
-    sizes = sharding.parse_mesh(args.mesh) if args.mesh else {}
+    sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     if args.devices:
         sizes.setdefault("data", max(1, args.devices // math.prod(sizes.values())))
     mesh = sharding.abstract_mesh(**sizes) if sizes else None

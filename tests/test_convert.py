@@ -517,6 +517,8 @@ def test_missing_shard_and_truncated_file(files, tmp_path):
     fails("truncated", "--wan", folder)
     second.write_bytes(b"")
     fails("not a safetensors file", "--wan", folder)
+    second.write_bytes(content + bytes(12))
+    fails("00002-of-00003.safetensors has 12 bytes behind its last tensor", "--wan", folder)
     made.save(second, {"patch_embedding.weight": np.ones(2, np.float32)})
     fails(r"00002-of-00003.safetensors lacks tensor", "--wan", folder)
 

@@ -164,6 +164,7 @@ class TestMesh:
             ("date=2", "data"),
             ("data=x", "data=NUMBER"),
             ("seq=1,seq=2", "must be one"),
+            (" ", "is empty"),
         ):
             with pytest.raises(UserError, match=says):
                 sharding.parse_mesh(text)

@@ -102,6 +102,8 @@ def _divisors(n: int) -> list[int]:
 def parse_mesh(text: str) -> dict[str, int]:
     """'data=2,fsdp=2,seq=2' (any part may be missing) as arguments of `make_mesh`."""
     sizes: dict[str, int] = {}
+    if not text.strip():
+        raise UserError("--mesh is empty: write data=2,fsdp=2,seq=2, or leave it out.")
     for part in text.split(","):
         name, _, value = part.strip().partition("=")
         if name not in MESH_AXES:

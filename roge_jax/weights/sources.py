@@ -179,7 +179,11 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
             raise UserError(
                 f"{file} has no readable safetensors header ({error}): download it again."
             ) from None
-    end = max((t.offset + t.nbytes for t in tensors.values()), default=0)
+    end = max((t.offset + t.nbytes for t in tensors.values()), default=8 + length)
+    if size > end:
+        raise UserError(
+            f"{file} has {size - end} bytes behind its last tensor: it is not what its header says; download it again."
+        )
     if size < end:
         raise UserError(
             f"{file} is truncated: {size} bytes of {end}, and {_first_beyond(tensors, size)} is cut off; copy it again."
