@@ -89,6 +89,9 @@ class FusionConfig:
     geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
     # The targets' appearance: the reconstruction's own frames, encoded, instead of the paper's zeros.
     preview: bool = False
+    # Per channel of the ray features, measured after the reconstruction was trained; None: features as they are.
+    feature_mean: tuple[float, ...] | None = None
+    feature_std: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -278,6 +281,8 @@ def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
         raise UserError(
             f"{source}: width {width} is not divisible by {heads} heads: correct one of them."
         )
+    if isinstance(made, RoGeConfig):
+        return _checked_features(made, source)
     return _checked_vae(made, source) if isinstance(made, VAEConfig) else made
 
 
@@ -303,6 +308,19 @@ def _checked_vae(cfg: VAEConfig, source: str) -> VAEConfig:
             )
     if not all(x > 0 for x in cfg.latent_std):
         raise UserError(f"{source}: 'latent_std' must be positive in every channel.")
+    return cfg
+
+
+def _checked_features(cfg: RoGeConfig, source: str) -> RoGeConfig:
+    width, found = cfg.renderer.width, (cfg.fusion.feature_mean, cfg.fusion.feature_std)
+    if found == (None, None):
+        return cfg
+    if any(x is None or len(x) != width for x in found):
+        raise UserError(
+            f"{source}.fusion: 'feature_mean' and 'feature_std' need {width} values each, the renderer's width."
+        )
+    if not all(x > 0 for x in found[1] or ()):
+        raise UserError(f"{source}.fusion: 'feature_std' must be positive in every channel.")
     return cfg
 
 

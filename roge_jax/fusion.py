@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .config import RoGeConfig
+from .config import FusionConfig, RoGeConfig
 from .core.layers import linear, linear_specs, patch_conv, patch_conv_specs
 from .core.params import Tree, zeros
 from .geometry.packing import pack_views, pixel_unshuffle
@@ -36,6 +36,36 @@ def fusion_specs(config: RoGeConfig) -> Tree:
         "rays_embed": patch_conv_specs(patch, 6 * 4 * 64, d, init=zeros),
         "geometry_embed": patch_conv_specs(patch, 4 * c, d, init=zeros),
     }
+
+
+def standardised(features: jax.Array, config: RoGeConfig) -> jax.Array:
+    """Ray features [.., d] with mean 0 and deviation 1 per channel, if their statistics were measured.
+
+    A few channels of a residual stream carry nearly all of its energy and little of what it says; gradients of the
+    geometry adapter would be about those alone.
+    """
+    mean, std = config.fusion.feature_mean, config.fusion.feature_std
+    if mean is None or std is None:
+        return features
+    lead = (None,) * (features.ndim - 1)
+    return (features - np.asarray(mean, np.float32)[lead]) / np.asarray(std, np.float32)[lead]
+
+
+def restandardised(p: Tree, old: FusionConfig, new: FusionConfig) -> Tree:
+    """Parameters of the fusion that do with the statistics `new` what `p` did with `old`."""
+    adapter = p["geometry_adapter"]
+    width = adapter["kernel"].shape[0]
+    (m0, s0), (m1, s1) = (
+        (np.zeros(width), np.ones(width))
+        if c.feature_mean is None or c.feature_std is None
+        else (np.asarray(c.feature_mean), np.asarray(c.feature_std))
+        for c in (old, new)
+    )
+    kernel = np.asarray(adapter["kernel"], np.float64)
+    bias = np.asarray(adapter["bias"], np.float64) + ((m1 - m0) / s0) @ kernel
+    moved = {"kernel": (s1 / s0)[:, None] * kernel, "bias": bias}
+    moved = {name: jnp.asarray(x, adapter[name].dtype) for name, x in moved.items()}
+    return p | {"geometry_adapter": moved}
 
 
 def appearance(

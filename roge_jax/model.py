@@ -208,6 +208,7 @@ def condition(
     """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views, contexts first."""
     preview = preview_latents(params, features[context_latents.shape[0] :], config=config)
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
+    features = fusion.standardised(features, config)
     return fusion.condition(params["fusion"], context_latents, rays, features, preview)
 
 

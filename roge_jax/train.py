@@ -393,6 +393,8 @@ def run_stage(args, stage, params, cfg, mesh=None):
         params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
+    if stage.objective == "recon":
+        params, cfg = stages.measure_features(params, source, cfg, args.seed)
     provenance = {
         "stage": stage.name,
         "steps": int(state["step"]),

@@ -299,6 +299,36 @@ def test_no_gradient_passes_through_the_preview():
         assert not np.any(leaf)
 
 
+def measured(config, mean, std):
+    stats = {"feature_mean": tuple(map(float, mean)), "feature_std": tuple(map(float, std))}
+    return dataclasses.replace(config, fusion=dataclasses.replace(config.fusion, **stats))
+
+
+def test_features_are_standardised_by_their_statistics():
+    rng = np.random.default_rng(7)
+    x = rng.normal(3.0, 5.0, (50, 4, 6, CONFIG.renderer.width)).astype(np.float32)
+    config = measured(CONFIG, x.mean((0, 1, 2)), x.std((0, 1, 2)))
+    y = np.asarray(fusion.standardised(jnp.asarray(x), config))
+    np.testing.assert_allclose(y.mean((0, 1, 2)), 0.0, atol=1e-5)
+    np.testing.assert_allclose(y.std((0, 1, 2)), 1.0, atol=1e-5)
+    assert fusion.standardised(x, CONFIG) is x
+
+
+def test_other_statistics_do_not_change_what_a_fusion_does():
+    rng = np.random.default_rng(8)
+    known, features, views = made_condition(CONFIG)
+    width = CONFIG.renderer.width
+    p, config = whole(), CONFIG
+    want = model.condition(p, known, features, views, config=config).tokens
+    for _ in range(2):  # from none, and from one to another
+        new = measured(config, rng.normal(0, 3, width), rng.uniform(0.1, 9, width))
+        p = p | {"fusion": fusion.restandardised(p["fusion"], config.fusion, new.fusion)}
+        config = new
+        got = model.condition(p, known, features, views, config=config).tokens
+        assert rel_l2(got, want) < ROUNDING
+    assert rel_l2(model.condition(p, known, features, views, config=CONFIG).tokens, want) > 0.1
+
+
 # Step 0.
 
 

@@ -563,6 +563,8 @@ def _in(name, value):
         (_in("vae.multipliers", 3), "give a list, of each a whole number"),
         (_in("vae.latent_mean", [1.0]), "'latent_mean' has 1 values for 16 channels"),
         (_in("vae.latent_std", [0.0] * 16), "'latent_std' must be positive"),
+        (_in("fusion.feature_std", [1.0] * 32), "need 32 values each"),
+        (_in("fusion.feature_std", [1.0] * 5), "need 32 values each"),
         (_in("flow.shift", -1.0), "'shift' is -1.0: it must be above 0"),
         (_in("max_context", 0), "'max_context' is 0"),
     ],

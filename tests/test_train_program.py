@@ -105,6 +105,27 @@ def test_a_stage_gets_what_its_objective_reads():
     jax.eval_shape(objective, trained, stages.read(frozen, decoder), batch, jax.random.key(0))
 
 
+def test_the_features_of_a_trained_reconstruction_are_measured(common):
+    cfg = config.preset("tiny")
+    params = model.init(jax.random.key(0), cfg)
+    source = open_source(None, cfg.height, cfg.width, 12)
+    moved, found = stages.measure_features(params, source, cfg, seed=3, clips=2)
+    mean, std = (np.asarray(x) for x in (found.fusion.feature_mean, found.fusion.feature_std))
+    assert mean.shape == std.shape == (cfg.renderer.width,) and np.all(std > 0)
+    assert dataclasses.replace(found, fusion=cfg.fusion) == cfg
+    same = {path for path, x in flatten(params).items() if flatten(moved)[path] is x}
+    assert set(flatten(params)) - same == {
+        "fusion/geometry_adapter/kernel",
+        "fusion/geometry_adapter/bias",
+    }
+    kernel = params["fusion"]["geometry_adapter"]["kernel"]
+    np.testing.assert_allclose(
+        moved["fusion"]["geometry_adapter"]["kernel"], std[:, None] * kernel, rtol=1e-5
+    )
+    stats = config.from_dict(config.to_dict(found))
+    assert stats == found
+
+
 def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):
     rgb = np.zeros((1, 6, 32, 64, 3), np.uint8)
     np.save(tmp_path / "shard_00000.rgb.npy", rgb)

@@ -28,6 +28,7 @@ from roge_jax.training import loop as training
 from roge_jax.training.loop import DivergenceDetector, LoopConfig, TrainingStopped
 from roge_jax.training.optim import (
     OptimConfig,
+    adam_shares,
     ema_update,
     learning_rate,
     make_optimiser,
@@ -535,6 +536,27 @@ def test_muon_takes_the_hidden_matrices_and_nothing_else():
             stacked = spec.axes[0] == "layers"  # a matrix per layer, never across layers
             assert dims.reduction_axis == tuple(range(stacked, len(spec.shape) - 1)), path
             assert dims.output_axis == len(spec.shape) - 1, path
+
+
+def test_wide_embeddings_take_smaller_steps_of_adam():
+    specs = model.specs(preset("mini"))
+    shares = flatten(adam_shares(specs))
+    small = {path: x for path, x in shares.items() if x != 1.0}
+    assert small == {
+        "fusion/rays_embed/kernel": 256 / (2 * 2 * 1536),
+        "fusion/geometry_embed/kernel": 256 / (2 * 2 * 512),
+    }
+    some = {name: specs[name] for name in ("fusion",)}
+    optimiser = make_optimiser(
+        OptimConfig(name="muon", learning_rate=1.0, warmup=1, clip=0.0, weight_decay=0.0), some, 10
+    )
+    p = params.init(jax.random.key(0), some)
+    updates, _ = optimiser.update(jax.tree.map(jnp.ones_like, p), optimiser.init(p), p)
+    flat = flatten(updates)
+    step = flat["fusion/rays_embed/bias"][0]  # Adam's first step is the same for every weight
+    for path, moved in flat.items():
+        if "embed" in path:
+            np.testing.assert_allclose(moved, shares[path] * step, rtol=1e-5)
 
 
 def test_a_muon_update_moves_every_direction_of_every_layer_alike():

@@ -58,7 +58,7 @@ def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str
     found = {
         "x0": jnp.concatenate(latents),
         "rays": plucker(views["K"], views["c2w"], config.height, config.width),
-        "features": features,
+        "features": fusion.standardised(features, config),
     }
     preview = model.preview_latents(params, features[len(latents[0]) :], config=config)
     return found if preview is None else found | {"preview": preview}

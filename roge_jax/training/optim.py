@@ -1,5 +1,7 @@
 """Optimisers: AdamW (the paper's branch of fine-tuning) and Muon (training small models from scratch)."""
 
+import math
+import operator
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -15,6 +17,7 @@ ADAM_ONLY = (
     r"patch_embed|rays?_embed|geometry_embed|time_embed|text_embed|clip_embed|camera_mlp/fc1"
     r"|head/|conv_in|conv_out"
 )
+WIDE = r"(^|/)(rays|geometry)_embed/"
 
 
 @dataclass(frozen=True)
@@ -64,6 +67,20 @@ def muon_dimensions(specs):
     return unflatten({path: leaf(path, spec) for path, spec in flatten(specs).items()})
 
 
+def adam_shares(specs):
+    """What each leaf takes of the learning rate beside Muon: 1, but for embeddings of thousands of inputs.
+
+    Adam's steps have one size per weight, so an output moves by the rate times the number of inputs: at the rate of the
+    others these two would change by a tenth of themselves in every step.
+    """
+
+    def share(path: str, spec: Spec) -> float:
+        wide = re.search(WIDE, path) and path.endswith("/kernel")
+        return min(1.0, 256.0 / math.prod(spec.shape[:-1])) if wide else 1.0
+
+    return unflatten({path: share(path, spec) for path, spec in flatten(specs).items()})
+
+
 def make_optimiser(cfg: OptimConfig, specs, steps: int) -> optax.GradientTransformation:
     """The transformation for trainable leaves declared by `specs`, with clipping and accumulation."""
     rate = learning_rate(cfg, steps // max(cfg.accumulate, 1))
@@ -78,6 +95,9 @@ def make_optimiser(cfg: OptimConfig, specs, steps: int) -> optax.GradientTransfo
             adam_b2=b2,
             muon_weight_dimension_numbers=muon_dimensions(specs),
         )
+        shares = adam_shares(specs)
+        scale = optax.stateless(lambda updates, _: jax.tree.map(operator.mul, updates, shares))
+        core = optax.chain(core, scale)
     else:
         core = optax.adamw(rate, b1, b2, weight_decay=cfg.weight_decay, mask=matrices)
     chain = optax.chain(optax.clip_by_global_norm(cfg.clip), core) if cfg.clip else core

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import model
+from .. import fusion, model
 from ..config import RoGeConfig
 from ..core.lora import attach
 from ..core.params import Tree
@@ -236,6 +236,40 @@ def measure_latents(
         latent_std=tuple(float(x) for x in values.std(0).round(4)),
     )
     return dataclasses.replace(config, vae=latents)
+
+
+def measure_features(
+    params: Tree, source, config: RoGeConfig, seed: int, clips: int = 16
+) -> tuple[Tree, RoGeConfig]:
+    """(params, config) with the mean and deviation of every channel of the ray features on training clips.
+
+    The fusion is rewritten for them and does what it did before.
+    """
+    size = config.height, config.width
+    views = ViewConfig(
+        contexts=(3,), context_weights=(1.0,), targets=config.frames, ordered=True, size=size
+    )
+    stage = Stage("", "joint", "", 1, 1, OptimConfig(), views)
+
+    @jax.jit
+    def features(params, views):
+        tokens = model.reconstruct(params, views, config=config)
+        return model.query_rays(params, tokens, views, config=config)
+
+    found = []
+    for i in range(clips):
+        batch = stage_batch(source, stage, config, seed + 1, i)
+        batch.pop("target_rgb")
+        one = features(params, {name: x[0] for name, x in batch.items()})
+        found.append(np.asarray(one, np.float64).reshape(-1, config.renderer.width))
+    values = np.concatenate(found)
+    measured = dataclasses.replace(
+        config.fusion,
+        feature_mean=tuple(float(f"{x:.5g}") for x in values.mean(0)),
+        feature_std=tuple(float(f"{max(x, 1e-3):.5g}") for x in values.std(0)),
+    )
+    moved = fusion.restandardised(params["fusion"], config.fusion, measured)
+    return params | {"fusion": moved}, dataclasses.replace(config, fusion=measured)
 
 
 def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16):
