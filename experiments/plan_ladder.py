@@ -39,7 +39,7 @@ from roge_jax.planning.plan import plan
 
 OUT = Path(__file__).parent / "results" / "plan_ladder.json"
 TRAIN_SEED = 500_000  # training seeds that no shipped pool used
-TOLERANCES = (0.01, 0.02, 0.04, 0.08)
+TOLERANCES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08)
 CONTROLS = ("fixed", "random", "uniform")
 
 

@@ -218,7 +218,7 @@ def _mini() -> RoGeConfig:
         dit=DiTConfig(
             width=256, heads=4, depth=8, ffn=1024, freq_dim=256, text_dim=64, text_len=0, clip_dim=0
         ),
-        fusion=FusionConfig(geometry_channels=128),
+        fusion=FusionConfig(geometry_channels=128, preview=True),
         flow=FlowConfig(shift=3.0, weighting="uniform"),  # few latent pixels need less noise
         lora=LoraConfig(dit_rank=8, recon_rank=8),
     )
