@@ -46,22 +46,27 @@ def video_stage(config: RoGeConfig, **changes) -> stages.Stage:
     return dataclasses.replace(base, views=views, **changes)
 
 
+def told(params: Tree, views: model.Views, features: jax.Array, *, config: RoGeConfig) -> dict:
+    """What the transformer is told beside the photos' latents: rays at generation size, features, the preview's latents."""
+    found = {
+        "rays": plucker(views["K"], views["c2w"], config.height, config.width),
+        "features": fusion.standardised(features, config),
+    }
+    photos = views["context_rgb"].shape[0]
+    preview = model.preview_latents(params, features[photos:], config=config)
+    return found if preview is None else found | {"preview": preview}
+
+
 @functools.partial(jax.jit, static_argnames="config")
 def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
-    """What no noise level changes: latents of all slots, rays at generation size, ray features, latents of the preview."""
+    """What no noise level changes: latents of all slots, and what the transformer is told."""
     tokens = model.reconstruct(params, views, config=config)
+    features = model.query_rays(params, tokens, views, config=config)
     latents = [
         model.encode_contexts(params, views["context_rgb"], config=config),
         model.encode_targets(params, views["target_rgb"], config=config),
     ]
-    features = model.query_rays(params, tokens, views, config=config)
-    found = {
-        "x0": jnp.concatenate(latents),
-        "rays": plucker(views["K"], views["c2w"], config.height, config.width),
-        "features": fusion.standardised(features, config),
-    }
-    preview = model.preview_latents(params, features[len(latents[0]) :], config=config)
-    return found if preview is None else found | {"preview": preview}
+    return {"x0": jnp.concatenate(latents)} | told(params, views, features, config=config)
 
 
 def encode_all(params: Tree, batches, config: RoGeConfig) -> dict[str, np.ndarray]:
@@ -267,8 +272,8 @@ def lora(
         """Flow error by noise level, and that of the RGB head, of one scene."""
         tokens = model.reconstruct(params, views, config=config)
         features = model.query_rays(params, tokens, views, config=config)
-        rays = plucker(views["K"], views["c2w"], config.height, config.width)
-        clip = {"x0": x0, "known": x0[:CONTEXTS], "seen": x0[:CONTEXTS], "rays": rays, "features": features}  # fmt: skip
+        clip = {"x0": x0, "known": x0[:CONTEXTS], "seen": x0[:CONTEXTS]}
+        clip |= told(params, views, features, config=config)
         sigmas = jnp.asarray(SIGMAS, jnp.float32)
         photometric = model.photometric(params, features, views, config=config)
         return errors_by_sigma(params, clip, key, sigmas, config=config), photometric
