@@ -198,8 +198,7 @@ def _conditions(ax, row: dict) -> None:
     for name, (colour, line) in styles.items():
         rise = 100 * (np.mean(row["errors"][name], 0) / whole - 1)
         label = name.removesuffix(": zero") if line == "-" else None
-        size = 8 if colour == "C1" else 3  # drawn below the case that adds the rays
-        ax.plot(row["sigmas"], rise, color=colour, ls=line, marker="o", ms=size, label=label)
+        ax.plot(row["sigmas"], rise, color=colour, ls=line, marker="o", ms=3, label=label)
     ax.plot([], [], color="0.4", ls="-", label="solid: zeroed")
     ax.plot([], [], color="0.4", ls="--", label="dashed: of another scene")
     ax.set_yscale("symlog", linthresh=0.1)
@@ -207,7 +206,8 @@ def _conditions(ax, row: dict) -> None:
     count = len(row["errors"]["all conditions"])
     ax.set_title(f"a condition taken away at test time (n = {count})", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.02, 1.0))
+    ax.set_ylim(top=1e5)  # room for the legend
+    ax.legend(fontsize=6, ncols=2, loc="upper center", columnspacing=0.8)
 
 
 def _finetune(ax, row: dict) -> None:
@@ -221,7 +221,8 @@ def _finetune(ax, row: dict) -> None:
     ax.set(xlabel="noise level sigma", ylabel="held-out flow error")
     ax.set_title(f"trained on for {steps} steps without it", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.legend(fontsize=7)
+    ax.set_ylim(top=1.5 * ax.get_ylim()[1])
+    ax.legend(fontsize=6, ncols=2, loc="upper center", columnspacing=0.8)
 
 
 def _spectrum(ax, row: dict) -> None:
