@@ -11,7 +11,6 @@ itself). A scene's `views` are a dict of arrays, contexts first:
     context_recon, target_recon             optional: the same views at reconstruction size
 """
 
-import re
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
@@ -21,9 +20,11 @@ import numpy as np
 
 from . import fusion
 from .config import RoGeConfig
+from .core.layers import resized
 from .core.lora import attach, lora_specs
-from .core.params import Spec, Tree, flatten, unflatten, zeros
+from .core.params import Spec, Tree, zeros
 from .core.params import init as init_specs
+from .core.params import split as split
 from .core.sharding import over_scenes
 from .fusion import Condition
 from .geometry.rays import plucker
@@ -70,16 +71,6 @@ def adapter_specs(config: RoGeConfig) -> Tree:
     return {**recon, "dit": lora_specs(tree["dit"], lora.dit_rank, lora.dit_match)}
 
 
-def split(params: Tree, pattern: str) -> tuple[Tree, Tree]:
-    """(leaves whose path matches `pattern`, the others): what trains and what is frozen."""
-    flat = flatten(params)
-    chosen = {path for path in flat if re.search(pattern, path)}
-    return (
-        unflatten({path: flat[path] for path in chosen}),
-        unflatten({path: leaf for path, leaf in flat.items() if path not in chosen}),
-    )
-
-
 # Reconstruction (Sec. 3.1).
 
 
@@ -89,13 +80,6 @@ def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Arra
         [config.recon_width / config.width, config.recon_height / config.height, 1.0]
     )
     return views["K"] * scale[None, :, None], views["c2w"]
-
-
-def resized(images: jax.Array, height: int, width: int) -> jax.Array:
-    """Images [v, h, w, 3] at another size: bilinear, antialiased."""
-    if images.shape[1:3] == (height, width):
-        return images
-    return jax.image.resize(images, (images.shape[0], height, width, 3), "bilinear", antialias=True)
 
 
 @jax.named_scope("reconstruct")

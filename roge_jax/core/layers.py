@@ -109,3 +109,10 @@ def patch_conv(p: Tree, x: jax.Array) -> jax.Array:
     """Images [.., h, w, c] -> tokens [.., h/p * w/p, d], as one matrix product over patches."""
     patch, d = p["kernel"].shape[0], p["kernel"].shape[-1]
     return linear(p | {"kernel": p["kernel"].reshape(-1, d)}, patchify(x, patch))
+
+
+def resized(images: jax.Array, height: int, width: int) -> jax.Array:
+    """Images [v, h, w, 3] at another size: bilinear, antialiased."""
+    if images.shape[1:3] == (height, width):
+        return images
+    return jax.image.resize(images, (images.shape[0], height, width, 3), "bilinear", antialias=True)

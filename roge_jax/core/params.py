@@ -4,6 +4,7 @@ A *spec tree* has a `Spec` at every leaf. Initial values, abstract shapes, shard
 conversion are all derived from it, so a leaf's shape is written down in exactly one place.
 """
 
+import re
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -95,6 +96,16 @@ def unflatten(flat: Mapping[str, Any]) -> Tree:
             node = node.setdefault(parent, {})
         node[name] = leaf
     return tree
+
+
+def split(params: Tree, pattern: str) -> tuple[Tree, Tree]:
+    """(leaves whose path matches `pattern`, the others): what trains and what is frozen."""
+    flat = flatten(params)
+    chosen = {path for path in flat if re.search(pattern, path)}
+    return (
+        unflatten({path: flat[path] for path in chosen}),
+        unflatten({path: leaf for path, leaf in flat.items() if path not in chosen}),
+    )
 
 
 def init(key: jax.Array, specs) -> Tree:
