@@ -89,6 +89,9 @@ class FusionConfig:
     geometry_channels: int = 384  # C of the geometry adapter; four frames make 4C
     # The targets' appearance: the reconstruction's own frames, encoded, instead of the paper's zeros.
     preview: bool = False
+    # Per latent channel: the preview's error on training clips, measured before the generator is trained. With it, the
+    # transformer corrects the velocity that a normal error of that size implies; None: it says the velocity itself.
+    preview_std: tuple[float, ...] | None = None
     # Per channel of the ray features, measured after the reconstruction was trained; None: features as they are.
     feature_mean: tuple[float, ...] | None = None
     feature_std: tuple[float, ...] | None = None
@@ -219,7 +222,8 @@ def _mini() -> RoGeConfig:
             width=256, heads=4, depth=8, ffn=1024, freq_dim=256, text_dim=64, text_len=0, clip_dim=0
         ),
         fusion=FusionConfig(geometry_channels=128, preview=True),
-        flow=FlowConfig(shift=3.0, weighting="uniform"),  # few latent pixels need less noise
+        # What the preview leaves open is small: it is decided at low noise levels, and those must not be rare.
+        flow=FlowConfig(shift=1.0, weighting="uniform"),
         lora=LoraConfig(dit_rank=8, recon_rank=8),
     )
 
@@ -282,7 +286,7 @@ def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
             f"{source}: width {width} is not divisible by {heads} heads: correct one of them."
         )
     if isinstance(made, RoGeConfig):
-        return _checked_features(made, source)
+        return _checked_preview(_checked_features(made, source), source)
     return _checked_vae(made, source) if isinstance(made, VAEConfig) else made
 
 
@@ -321,6 +325,17 @@ def _checked_features(cfg: RoGeConfig, source: str) -> RoGeConfig:
         )
     if not all(x > 0 for x in found[1] or ()):
         raise UserError(f"{source}.fusion: 'feature_std' must be positive in every channel.")
+    return cfg
+
+
+def _checked_preview(cfg: RoGeConfig, source: str) -> RoGeConfig:
+    std, channels = cfg.fusion.preview_std, cfg.vae.latent
+    if std is None:
+        return cfg
+    if not cfg.fusion.preview or len(std) != channels or not all(x > 0 for x in std):
+        raise UserError(
+            f"{source}.fusion: 'preview_std' needs 'preview' and {channels} positive values, one per latent channel."
+        )
     return cfg
 
 

@@ -21,11 +21,13 @@ class Condition(NamedTuple):
     """What the transformer knows besides the noisy latents: the same at every noise level.
 
     appearance: [t, lh, lw, 20] = [mask 4, context latents or, on targets, zeros or those of a preview 16];
-    tokens: [l, d], the sum of the embedded rays and ray features.
+    tokens: [l, d], the sum of the embedded rays and ray features;
+    spread: [16], the deviation of clean target latents from the preview, if there is one and it was measured.
     """
 
     appearance: jax.Array
     tokens: jax.Array
+    spread: jax.Array | None = None
 
 
 def fusion_specs(config: RoGeConfig) -> Tree:
@@ -109,17 +111,28 @@ def condition(
     plucker: jax.Array,
     features: jax.Array,
     preview: jax.Array | None = None,
+    preview_std: tuple[float, ...] | None = None,
 ) -> Condition:
     """All of C = {Y, P, G}; plucker [m + n, h, w, 6] at generation size, features [m + n, gh, gw, d], `preview` as in
-    `appearance`."""
+    `appearance`, its deviation per channel if it was measured.
+    """
     contexts = context_latents.shape[0]
     rays = ray_condition(plucker, contexts)
     lh, lw = rays.shape[1:3]
     geometry = geometry_condition(p, features, (lh, lw), contexts)
     tokens = patch_conv(p["rays_embed"], rays) + patch_conv(p["geometry_embed"], geometry)
-    return Condition(
-        appearance(context_latents, rays.shape[0], preview), tokens.reshape(-1, tokens.shape[-1])
-    )
+    spread = None
+    if preview is not None and preview_std is not None:
+        spread = jnp.asarray(preview_std, jnp.float32)
+    known = appearance(context_latents, rays.shape[0], preview)
+    return Condition(known, tokens.reshape(-1, tokens.shape[-1]), spread)
+
+
+def unconditioned(context_latents: jax.Array, slots: int, config: RoGeConfig) -> Condition:
+    """The condition of the generation-only model: appearance, but neither rays nor geometry nor a preview."""
+    lh, lw = config.latent_size
+    tokens = slots * (lh // config.dit.patch) * (lw // config.dit.patch)
+    return Condition(appearance(context_latents, slots), jnp.zeros((tokens, config.dit.width)))
 
 
 def time_index(contexts: int, slots: int) -> np.ndarray:

@@ -12,7 +12,7 @@ itself). A scene's `views` are a dict of arrays, contexts first:
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,7 +32,6 @@ from .recon import ray_scene, vggt
 from .recon.relative import Relative, relative_cameras
 from .video import dit, flow, solvers, vae, vae_training
 
-ContextSlots = Literal["noised", "clean", "free"]
 Views = dict[str, jax.Array]
 
 # What trains when pretrained networks are adapted (Sec. 3.3): the new embeddings and E1 fully, the rest by LoRA.
@@ -193,15 +192,9 @@ def condition(
     preview = preview_latents(params, features[context_latents.shape[0] :], config=config)
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
     features = fusion.standardised(features, config)
-    return fusion.condition(params["fusion"], context_latents, rays, features, preview)
-
-
-def unconditioned(context_latents: jax.Array, slots: int, *, config: RoGeConfig) -> Condition:
-    """The condition of the generation-only model: appearance, but neither rays nor geometry."""
-    lh, lw = config.latent_size
-    tokens = slots * (lh // config.dit.patch) * (lw // config.dit.patch)
-    known = fusion.appearance(context_latents, slots)
-    return Condition(known, jnp.zeros((tokens, config.dit.width)))
+    return fusion.condition(
+        params["fusion"], context_latents, rays, features, preview, config.fusion.preview_std
+    )
 
 
 @jax.named_scope("transformer")
@@ -225,7 +218,7 @@ def velocity(
     rows = None
     if cfg.text_len and text is None:
         rows = dit.context_rows(params["dit"], params["prompt"]["rows"], cfg=cfg)
-    return dit.dit(
+    output = dit.dit(
         params["dit"],
         jnp.concatenate([x, cond.appearance], -1),
         1000.0 * sigma,
@@ -236,6 +229,22 @@ def velocity(
         extra_tokens=cond.tokens,
         remat=remat,
     )
+    return about_preview(output, x, sigma, cond, contexts)
+
+
+def about_preview(
+    output: jax.Array, x: jax.Array, sigma: jax.Array, cond: Condition, contexts: int
+) -> jax.Array:
+    """The velocity that the transformer's `output` [t, lh, lw, 16] stands for at x.
+
+    Targets with a preview of known error: mean + deviation * output (`flow.velocity_about`), as Karras et al. (2022)
+    precondition a denoiser about 0. Everything else is the velocity itself.
+    """
+    if cond.spread is None:
+        return output
+    preview = cond.appearance[contexts:, ..., fusion.MASK_CHANNELS :]
+    mean, deviation = flow.velocity_about(preview, cond.spread, x[contexts:], sigma)
+    return jnp.concatenate([output[:contexts], mean + deviation * output[contexts:]])
 
 
 def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
@@ -364,19 +373,6 @@ def loss(
 # Sampling.
 
 
-def context_projection(x0: jax.Array, noise: jax.Array, mode: ContextSlots) -> Callable | None:
-    """What happens to the context slots before the network looks: noised to sigma (as in training), clean, or free."""
-    m = x0.shape[0]
-    if mode == "free":
-        return None
-
-    def project(x, sigma):
-        known = flow.x_sigma(x0, noise[:m], sigma) if mode == "noised" else x0
-        return jnp.concatenate([known, x[m:]])
-
-    return project
-
-
 class Prepared(NamedTuple):
     """All that sampling needs and that no noise level changes; computed once per window."""
 
@@ -409,7 +405,7 @@ def sampling_field(
     noise: jax.Array,
     *,
     config: RoGeConfig,
-    mode: ContextSlots = "noised",
+    mode: flow.ContextSlots = "noised",
 ) -> tuple[Callable, Callable | None]:
     """(velocity(x, sigma), project(x, sigma) or None) for the functions of `video.solvers`."""
     m = prepared.context_latents.shape[0]
@@ -419,7 +415,7 @@ def sampling_field(
             params, x, sigma, prepared.condition, config=config, contexts=m, text=prepared.text
         )
 
-    return field, context_projection(prepared.context_latents, noise, mode)
+    return field, flow.context_projection(prepared.context_latents, noise, mode)
 
 
 def generate(
@@ -430,7 +426,7 @@ def generate(
     config: RoGeConfig,
     solver: "str | solvers.Table" = "euler",
     sigmas: np.ndarray | None = None,
-    mode: ContextSlots = "noised",
+    mode: flow.ContextSlots = "noised",
 ) -> tuple[jax.Array, solvers.SolveInfo]:
     """Integrate from noise to the target latents [t, lh, lw, 16]; context slots are dropped. Jit-able."""
     field, project = sampling_field(params, prepared, noise, config=config, mode=mode)

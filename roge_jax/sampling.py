@@ -52,7 +52,7 @@ class Settings:
     solver: str = SOLVER
     schedule: str = SCHEDULE
     seed: int = 0
-    slots: model.ContextSlots = "noised"
+    slots: flow.ContextSlots = "noised"
     long: Literal["chain", "independent"] = "chain"
     scale: float | None = None  # divisor of all positions, in scene units; None: the model's rule
 
@@ -192,7 +192,7 @@ def velocity(
     sigma,
     *,
     config: RoGeConfig,
-    slots: model.ContextSlots,
+    slots: flow.ContextSlots,
 ):
     """The network on a state whose context slots are first set as `slots` asks (the solver's own state keeps its own)."""
     field, project = model.sampling_field(params, prepared, noise, config=config, mode=slots)
@@ -218,7 +218,7 @@ def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.
 
 
 def programs(
-    params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots
+    params: Tree, views: model.Views, config: RoGeConfig, slots: flow.ContextSlots
 ) -> Programs:
     """Compile all pieces for the shapes of `views`, side by side: compiling is what a short run waits for.
 
@@ -272,7 +272,7 @@ def rgb_head(
 
 
 def preview_program(
-    params: Tree, views: model.Views, config: RoGeConfig, slots: model.ContextSlots
+    params: Tree, views: model.Views, config: RoGeConfig, slots: flow.ContextSlots
 ) -> PreviewProgram:
     """`programs` for a window that is not generated."""
     piece = jax.jit(functools.partial(rgb_head, config=config))

@@ -326,6 +326,9 @@ def run_stage(args, stage, params, cfg, mesh=None):
     size = working.height, working.width
     window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
     source = open_source(args.data, *size, window)
+    if stage.about_preview and cfg.fusion.preview and cfg.fusion.preview_std is None:
+        params, cfg = stages.measure_preview(params, source, cfg, args.seed)
+        working = stages.stage_config(cfg, stage)
     stage = dataclasses.replace(stage, views=dataclasses.replace(stage.views, size=size))
     trainable, frozen = model.split(params, stage.trains)
     specs, frozen_specs = stages.stage_specs(cfg, stage)
@@ -393,6 +396,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
         params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
+        cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview_std=None))
     if stage.objective == "recon":
         params, cfg = stages.measure_features(params, source, cfg, args.seed)
     provenance = {

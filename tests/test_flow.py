@@ -34,6 +34,27 @@ def test_path_ends_at_sample_and_noise_and_its_slope_is_the_target():
     np.testing.assert_allclose(flow.denoised(seen, target, sigma), x0, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("spread", [0.05, 0.34, 1.0])
+@pytest.mark.parametrize("sigma", [0.0, 0.03, 0.3, 0.8, 1.0])
+def test_the_velocity_about_a_guess_is_the_conditional_distribution(sigma, spread):
+    """The moments of (noise - x0, x) are known in float64; conditioning them is two lines of linear algebra."""
+    guess, rng = 0.7, np.random.default_rng(3)
+    rows = np.array([[-1.0, 1.0], [1.0 - sigma, sigma]])  # (noise - x0, x) of (x0, noise)
+    covariance = rows @ np.diag([spread**2, 1.0]) @ rows.T
+    slope = covariance[0, 1] / covariance[1, 1]
+    x = rng.normal(0, 2, (3, 5, 4))
+    want = -guess + slope * (x - (1 - sigma) * guess)
+    deviation = np.sqrt(np.linalg.det(covariance) / covariance[1, 1])
+    mean, std = flow.velocity_about(
+        jnp.full(x.shape, guess, jnp.float32),
+        jnp.full(4, spread),
+        jnp.asarray(x, jnp.float32),
+        jnp.float32(sigma),
+    )
+    np.testing.assert_allclose(mean, want, rtol=2e-5, atol=2e-5)
+    np.testing.assert_allclose(std, np.full_like(x, deviation), rtol=1e-4)
+
+
 @pytest.mark.parametrize("steps", CONFIG["n"])
 @pytest.mark.parametrize("shift", CONFIG["shift"])
 @pytest.mark.parametrize(

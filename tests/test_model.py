@@ -181,7 +181,7 @@ def test_the_loss_ignores_context_slots():
     p, key = with_constant_velocity(), jax.random.key(3)
     rng = np.random.default_rng(0)
     x0 = jnp.asarray(rng.standard_normal((SLOTS, *CONFIG.latent_size, 16)), jnp.float32)
-    cond = model.unconditioned(x0[:M], SLOTS, config=CONFIG)
+    cond = fusion.unconditioned(x0[:M], SLOTS, CONFIG)
     got = flow_term(p, x0, cond, key)
     assert float(flow_term(p, x0.at[:M].add(7.0), cond, key)) == float(got)
     assert float(flow_term(p, x0.at[M:].add(7.0), cond, key)) != float(got)
@@ -299,6 +299,56 @@ def test_no_gradient_passes_through_the_preview():
         assert not np.any(leaf)
 
 
+SPREAD = tuple(float(f"{x:.3g}") for x in np.geomspace(0.1, 0.6, 16))
+ABOUT = dataclasses.replace(PREVIEW, fusion=dataclasses.replace(PREVIEW.fusion, preview_std=SPREAD))
+
+
+def silent(p):
+    """The same parameters, with a transformer that says 0."""
+    return p | {"dit": p["dit"] | {"head": jax.tree.map(jnp.zeros_like, p["dit"]["head"])}}
+
+
+def test_a_transformer_that_says_nothing_generates_the_preview_and_its_error():
+    """The exact flow of a normal distribution: noise arrives at preview + spread * noise."""
+    known, features, views = made_condition(ABOUT)
+    cond = model.condition(whole(), known, features, views, config=ABOUT)
+    ready = model.Prepared(known, features, cond, None)
+    noise = model.draw_noise(jax.random.key(5), M, config=ABOUT)
+    run = functools.partial(model.generate, silent(whole()), ready, noise, config=ABOUT)
+    found, _ = run(solver="rk4", sigmas=flow.schedule("graded", 40))
+    preview = cond.appearance[M:, ..., 4:]
+    np.testing.assert_allclose(
+        found, preview + np.asarray(SPREAD)[None, None, None] * noise[M:], atol=2e-4
+    )
+    coarse, _ = run(solver="euler", sigmas=flow.schedule("graded", 4))
+    assert np.abs(coarse - found).max() > 0.05, "steps matter"
+
+
+def test_about_a_preview_the_transformer_corrects_in_units_of_its_error():
+    known, features, views = made_condition(ABOUT)
+    x = model.draw_noise(jax.random.key(6), M, config=ABOUT)
+    said, quiet, plain = (
+        model.velocity(
+            p,
+            x,
+            jnp.float32(1.0),
+            model.condition(p, known, features, views, config=config),
+            config=config,
+            contexts=M,
+        )
+        for p, config in ((whole(), ABOUT), (silent(whole()), ABOUT), (whole(), PREVIEW))
+    )
+    np.testing.assert_allclose(
+        (said - quiet)[M:], np.asarray(SPREAD)[None, None, None] * plain[M:], rtol=1e-4, atol=1e-5
+    )
+    np.testing.assert_array_equal(said[:M], plain[:M])  # contexts: the velocity itself
+    alone = fusion.unconditioned(known, SLOTS, ABOUT)  # and wherever no preview is shown
+    np.testing.assert_array_equal(
+        model.velocity(whole(), x, jnp.float32(0.5), alone, config=ABOUT, contexts=M),
+        model.velocity(whole(), x, jnp.float32(0.5), alone, config=CONFIG, contexts=M),
+    )
+
+
 def measured(config, mean, std):
     stats = {"feature_mean": tuple(map(float, mean)), "feature_std": tuple(map(float, std))}
     return dataclasses.replace(config, fusion=dataclasses.replace(config.fusion, **stats))
@@ -397,10 +447,10 @@ def test_the_three_modes_of_context_slots():
     rng = np.random.default_rng(6)
     x0, x, noise = (jnp.asarray(rng.standard_normal((s, 2, 2, 16)), jnp.float32) for s in (M, 5, 5))
     sigma = jnp.asarray(0.25)
-    assert model.context_projection(x0, noise, "free") is None
-    noised = model.context_projection(x0, noise, "noised")(x, sigma)
+    assert flow.context_projection(x0, noise, "free") is None
+    noised = flow.context_projection(x0, noise, "noised")(x, sigma)
     np.testing.assert_allclose(noised[:M], 0.75 * x0 + 0.25 * noise[:M], rtol=1e-6)
-    clean = model.context_projection(x0, noise, "clean")(x, sigma)
+    clean = flow.context_projection(x0, noise, "clean")(x, sigma)
     np.testing.assert_array_equal(clean[:M], x0)
     for y in (noised, clean):
         np.testing.assert_array_equal(y[M:], x[M:])

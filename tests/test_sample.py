@@ -565,6 +565,7 @@ def _in(name, value):
         (_in("vae.latent_std", [0.0] * 16), "'latent_std' must be positive"),
         (_in("fusion.feature_std", [1.0] * 32), "need 32 values each"),
         (_in("fusion.feature_std", [1.0] * 5), "need 32 values each"),
+        (_in("fusion.preview_std", [1.0] * 5), "needs 'preview' and 16 positive values"),
         (_in("flow.shift", -1.0), "'shift' is -1.0: it must be above 0"),
         (_in("max_context", 0), "'max_context' is 0"),
     ],

@@ -6,14 +6,16 @@ import json
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_sharding import small
 
 from roge_jax import config, entry, model, train
-from roge_jax.checkpoint import load_model
+from roge_jax.checkpoint import load_model, save_model
 from roge_jax.core.params import flatten
 from roge_jax.data.source import open_source
+from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.training import stages
 
@@ -124,6 +126,54 @@ def test_the_features_of_a_trained_reconstruction_are_measured(common):
     )
     stats = config.from_dict(config.to_dict(found))
     assert stats == found
+
+
+def test_the_error_of_the_preview_is_measured_and_the_head_starts_again(common):
+    cfg = config.preset("tiny")
+    cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview=True))
+    params = model.init(jax.random.key(0), cfg)
+    params["dit"]["head"]["linear"]["kernel"] += 1.0
+    source = open_source(None, cfg.height, cfg.width, 12)
+    moved, found = stages.measure_preview(params, source, cfg, seed=3, clips=1)
+    assert config.from_dict(config.to_dict(found)) == found
+    assert dataclasses.replace(found, fusion=cfg.fusion) == cfg
+    before, after = flatten(params), flatten(moved)
+    changed = {path for path, x in before.items() if after[path] is not x}
+    assert changed == {"dit/head/linear/kernel", "dit/head/linear/bias"}
+    assert not any(np.any(after[path]) for path in changed)
+    # A transformer that says nothing about noise at sigma = 1 is off by preview_std, by definition.
+    views = ViewConfig(
+        contexts=(3,), context_weights=(1.0,), targets=cfg.frames, ordered=True, size=(32, 48)
+    )
+    batch = draw_batch(source, 4, 0, 1, views, scale_rule=cfg.scale_rule)
+    views = {name: jnp.asarray(x[0]) for name, x in batch.items()}
+    prepared = model.prepare(moved, views, config=found)
+    noise = model.draw_noise(jax.random.key(1), 3, config=found)
+    velocity = model.velocity(
+        moved, noise, jnp.float32(1.0), prepared.condition, config=found, contexts=3
+    )
+    target = model.encode_targets(moved, views["target_rgb"], config=found)
+    error = np.asarray((noise - velocity)[3:] - target).reshape(-1, cfg.vae.latent)
+    np.testing.assert_allclose(
+        np.sqrt(np.square(error).mean(0)), found.fusion.preview_std, rtol=2e-3
+    )
+
+
+def test_a_generator_is_trained_about_the_preview_once(common, tmp_path, monkeypatch):
+    cfg = config.preset("tiny")
+    cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview=True))
+    save_model(tmp_path / "start", model.init(jax.random.key(0), cfg), cfg)
+    calls, measure = [], stages.measure_preview
+    monkeypatch.setattr(
+        stages, "measure_preview", lambda *a: calls.append(1) or measure(*a, clips=1)
+    )
+    start = tmp_path / "start"
+    for k in (1, 2):
+        words = ["--steps", 1, "--batch", 1, "--out", tmp_path / f"{k}"]
+        run(*common, "--stage", "generator", "--init", start, *words)
+        start = tmp_path / f"{k}" / "generator" / "model"
+        assert load_model(start)[1].fusion.preview_std is not None
+    assert len(calls) == 1
 
 
 def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):

@@ -21,7 +21,7 @@ from roge_jax.core.params import flatten, unflatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.metrics import baselines
 from roge_jax.sampling import SCHEDULE, SOLVER, STEPS
-from roge_jax.video import dit
+from roge_jax.video import dit, flow
 
 from .measures import Judge, difference, summary
 from .scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos, preparer
@@ -46,8 +46,8 @@ def sampled(params, config: RoGeConfig, scenes: Scenes) -> tuple[Record, dict[st
 
 
 def generation_only(scenes: Scenes, config: RoGeConfig) -> Scenes:
-    """The same photos and noise, with neither rays nor ray features: `model.unconditioned`."""
-    make = functools.partial(model.unconditioned, slots=config.slots(scenes.m), config=config)
+    """The same photos and noise, with neither rays nor ray features: `fusion.unconditioned`."""
+    make = functools.partial(fusion.unconditioned, slots=config.slots(scenes.m), config=config)
     bare = jax.vmap(make)(scenes.prepared.context_latents)
     return scenes._replace(prepared=scenes.prepared._replace(condition=bare))
 
@@ -209,7 +209,7 @@ def with_block_cache(params, config: RoGeConfig, scenes: Scenes, judge: Judge, e
         def one(prepared, noise, x, change):
             latents, cond = prepared.context_latents, prepared.condition
             m = latents.shape[0]
-            x = model.context_projection(latents, noise, "noised")(x, sigma)
+            x = flow.context_projection(latents, noise, "noised")(x, sigma)
             t, lh, lw, _ = x.shape
             rows, columns = lh // cfg.patch, lw // cfg.patch
             angles = jnp.asarray(
@@ -227,7 +227,8 @@ def with_block_cache(params, config: RoGeConfig, scenes: Scenes, judge: Judge, e
             if fresh:
                 change = blocks(first, slice(1, -1)) - first
             last = blocks(first + change, slice(-1, None))
-            return dit.head(p, last, e, grid=(t, rows, columns), patch=cfg.patch), change
+            output = dit.head(p, last, e, grid=(t, rows, columns), patch=cfg.patch)
+            return model.about_preview(output, x, sigma, cond, m), change
 
         return jax.vmap(one)(prepared, noise, x, change)
 

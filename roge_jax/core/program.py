@@ -27,7 +27,7 @@ CHEAP = {
     "lt", "le", "gt", "ge", "abs", "sign", "floor", "ceil", "round", "clamp", "select_n",
     "convert_element_type", "broadcast_in_dim", "iota", "slice", "dynamic_slice",
     "rev", "pad", "is_finite", "integer_pow", "square", "shift_right_logical", "shift_left",
-    "split",
+    "split", "one_minus_square", "polynomial",
 }  # fmt: skip
 # ... and these only if there is one reader.
 DEAR = {
@@ -101,10 +101,9 @@ def read(jaxpr, scope: str = "") -> Program:
             if inner is not None:
                 found = inline(getattr(inner, "jaxpr", inner), reads, here)
             elif name == "scan" and params["length"] == 1:
-                body, kept = params["jaxpr"].jaxpr, params["num_consts"] + params["num_carry"]
+                body, (kept, carried) = params["jaxpr"].jaxpr, _scan_ends(params)
                 xs = [alias(v, a.aval, here) for v, a in zip(reads[kept:], body.invars[kept:])]
                 found = inline(body, reads[:kept] + xs, here)
-                carried = params["num_carry"]
                 ys = zip(found[carried:], eqn.outvars[carried:])
                 found = found[:carried] + [alias(v, var.aval, here) for v, var in ys]
             else:
@@ -311,6 +310,15 @@ def _held(weight: float, op: Op, aval) -> Held:
     return Held(weight, op.name, f"{getattr(aval, 'dtype', '')}{list(aval.shape)}", op.scope)
 
 
+def _scan_ends(params: dict) -> tuple[int, int]:
+    """Where a scan's inputs become those it walks over, and where its outputs become those it collects."""
+    if "ft_in" in params:  # JAX 0.12: a tree of constants, carried values and what is walked over
+        constants, carried = (len(part) for part in params["ft_in"].unpack()[:2])
+    else:
+        constants, carried = params["num_consts"], params["num_carry"]
+    return constants + carried, carried
+
+
 def _inside(op: Op, weigh: Callable[[Any, str], float]) -> Peak:
     """The peak within one turn of a loop or one branch, beside what goes in and comes out."""
     found = []
@@ -318,11 +326,8 @@ def _inside(op: Op, weigh: Callable[[Any, str], float]) -> Peak:
         if op.name != "scan":
             found.append(peak(inner, weigh, elsewhere=inner.inputs))
             continue
-        kept = op.params["num_consts"] + op.params["num_carry"]
-        carried, ys = (
-            inner.outputs[: op.params["num_carry"]],
-            inner.outputs[op.params["num_carry"] :],
-        )
+        kept, count = _scan_ends(op.params)
+        carried, ys = inner.outputs[:count], inner.outputs[count:]
         ops = _with_slices(inner.ops, inner.inputs[kept:], op.scope)
         ops += [Op("dynamic_update_slice", (v,), (), {}, (), op.scope) for v in dict.fromkeys(ys)]
         inner = inner._replace(ops=_sooner(ops), outputs=carried)

@@ -37,6 +37,7 @@ class Stage:
     remat: dit.Remat = "dots"  # what the transformer's backward pass recomputes
     crop: int | None = None  # side of random square crops (VAE stages)
     recon_shrink: int = 1  # divides the size at which the reconstruction works
+    about_preview: bool = False  # measure the preview first, if nobody has: `measure_preview`
 
 
 def vae_objective(trainable, frozen, batch, key, *, config, stage):
@@ -76,7 +77,7 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
             model.encode_targets(params, views["target_rgb"], config=config),
         ]
         x0 = jax.lax.stop_gradient(jnp.concatenate(latents))
-        cond = model.unconditioned(x0[:m], x0.shape[0], config=config)
+        cond = fusion.unconditioned(x0[:m], x0.shape[0], config)
         options = {"config": config, "contexts": m, "remat": stage.remat}
         return model.mean_flow_matching(params, x0, cond, key, draws=stage.draws, **options)
 
@@ -122,7 +123,17 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
         ),
         Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
-        Stage("generator", "joint", "^(dit|fusion)/", 3000, 3, _SCRATCH, video, draws=12),
+        Stage(
+            "generator",
+            "joint",
+            "^(dit|fusion)/",
+            3000,
+            3,
+            _SCRATCH,
+            video,
+            draws=12,
+            about_preview=True,
+        ),
         # The latents stay as the generator knows them: only their decoding still improves.
         Stage("vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=64),
         Stage(
@@ -245,24 +256,12 @@ def measure_features(
 
     The fusion is rewritten for them and does what it did before.
     """
-    size = config.height, config.width
-    views = ViewConfig(
-        contexts=(3,), context_weights=(1.0,), targets=config.frames, ordered=True, size=size
-    )
-    stage = Stage("", "joint", "", 1, 1, OptimConfig(), views)
 
-    @jax.jit
     def features(params, views):
         tokens = model.reconstruct(params, views, config=config)
         return model.query_rays(params, tokens, views, config=config)
 
-    found = []
-    for i in range(clips):
-        batch = stage_batch(source, stage, config, seed + 1, i)
-        batch.pop("target_rgb")
-        one = features(params, {name: x[0] for name, x in batch.items()})
-        found.append(np.asarray(one, np.float64).reshape(-1, config.renderer.width))
-    values = np.concatenate(found)
+    values = _on_clips(features, params, source, config, seed, clips)
     measured = dataclasses.replace(
         config.fusion,
         feature_mean=tuple(float(f"{x:.5g}") for x in values.mean(0)),
@@ -270,6 +269,47 @@ def measure_features(
     )
     moved = fusion.restandardised(params["fusion"], config.fusion, measured)
     return params | {"fusion": moved}, dataclasses.replace(config, fusion=measured)
+
+
+def measure_preview(
+    params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32
+) -> tuple[Tree, RoGeConfig]:
+    """(params, config) with the preview's root mean square error per latent channel on training clips.
+
+    What the transformer says means another thing from here on (`model.about_preview`), so its head starts from zero:
+    until it is trained it generates the preview and noise of that size.
+    """
+
+    def error(params, views):
+        m = views["context_rgb"].shape[0]
+        tokens = model.reconstruct(params, views, config=config)
+        features = model.query_rays(params, tokens, views, config=config)
+        preview = model.preview_latents(params, features[m:], config=config)
+        return model.encode_targets(params, views["target_rgb"], config=config) - preview
+
+    values = _on_clips(error, params, source, config, seed, clips)
+    rms = np.sqrt(np.square(values).mean(0))
+    measured = dataclasses.replace(
+        config.fusion, preview_std=tuple(float(f"{max(x, 1e-3):.4g}") for x in rms)
+    )
+    head = jax.tree.map(jnp.zeros_like, params["dit"]["head"]["linear"])
+    transformer = params["dit"] | {"head": params["dit"]["head"] | {"linear": head}}
+    return params | {"dit": transformer}, dataclasses.replace(config, fusion=measured)
+
+
+def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, clips: int):
+    """Rows [.., channels] float64 of `function(params, views)` on training clips with three photos each."""
+    size = config.height, config.width
+    views = ViewConfig(
+        contexts=(3,), context_weights=(1.0,), targets=config.frames, ordered=True, size=size
+    )
+    stage = Stage("", "joint", "", 1, 1, OptimConfig(), views)
+    run, found = jax.jit(function), []
+    for i in range(clips):
+        batch = stage_batch(source, stage, config, seed + 1, i)
+        one = np.asarray(run(params, {name: x[0] for name, x in batch.items()}), np.float64)
+        found.append(one.reshape(-1, one.shape[-1]))
+    return np.concatenate(found)
 
 
 def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16):

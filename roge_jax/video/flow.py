@@ -12,6 +12,7 @@ made on the host, so that they are checked before anything is compiled.
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from roge_jax.errors import UserError, did_you_mean
 
 TRAIN_POINTS = 1000
 SCHEDULES = ("shift", "unipc", "dpmpp", "uniform", "graded", "optimised")
+ContextSlots = Literal["noised", "clean", "free"]
 WEIGHTS = ("bump", "uniform")
 SIGMA_SAMPLERS = ("uniform_index", "logit_normal")
 OPTIMISED_FILE = Path(__file__).with_name("schedules.json")
@@ -50,6 +52,37 @@ def velocity_target(x0: Array, noise: Array) -> Array:
 def denoised(x: Array, velocity: Array, sigma: Array) -> Array:
     """The clean sample implied by a velocity: x0 = x - sigma v."""
     return x - _per_sample(sigma, x) * velocity
+
+
+def velocity_about(guess: Array, spread: Array, x: Array, sigma: Array) -> tuple[Array, Array]:
+    """Mean and standard deviation of noise - x0 at x = x_sigma if x0 is normal about `guess` with deviation `spread`.
+
+    The line through two jointly normal variables: with y = x - (1 - sigma) guess and
+    d = (1 - sigma)^2 spread^2 + sigma^2,
+
+        mean = (sigma - (1 - sigma) spread^2) / d  y - guess,      deviation = spread / sqrt(d),
+
+    which is x - guess and spread at sigma = 1, and -x and 1 at sigma = 0. `guess` and x are [.., c], `spread` [c] is
+    above 0; sigma is a scalar or has the leading axes of x.
+    """
+    s, spread = _per_sample(sigma, x), jnp.reshape(spread, (1,) * (x.ndim - 1) + (-1,))
+    variance = jnp.square(spread)
+    total = jnp.square(1 - s) * variance + jnp.square(s)
+    mean = (s - (1 - s) * variance) / total * (x - (1 - s) * guess) - guess
+    return mean, jnp.broadcast_to(spread / jnp.sqrt(total), x.shape)
+
+
+def context_projection(x0: Array, noise: Array, mode: ContextSlots) -> Callable | None:
+    """What happens to the context slots before the network looks: noised to sigma (as in training), clean, or free."""
+    m = x0.shape[0]
+    if mode == "free":
+        return None
+
+    def project(x, sigma):
+        known = x_sigma(x0, noise[:m], sigma) if mode == "noised" else x0
+        return jnp.concatenate([known, x[m:]])
+
+    return project
 
 
 def shifted(u, shift: float):
