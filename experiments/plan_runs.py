@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from roge_jax import evaluate, model, sampling
+from roge_jax import evaluate, model, preview, sampling
 from roge_jax.data import procedural
 from roge_jax.data.raycast import OBJECTS, ROOM, render_views
 from roge_jax.geometry.cameras import Cameras, normalise
@@ -156,18 +156,20 @@ class Engine:
             frames = np.asarray(model.resized(head, config.height, config.width))
         else:
             frames = np.asarray(
-                self.decode(self.params, self.latents(scene, choices, views, features))
+                self.decode(self.params, *self.latents(scene, choices, views, features))
             )
         scene.kept[choices] = frames
         return frames
 
-    def latents(self, scene, choices, views, features) -> jax.Array:
+    def latents(self, scene, choices, views, features) -> tuple[jax.Array, jax.Array | None]:
+        """Those of the targets, and what is added to them when they are decoded."""
         m = len(choices.photos)
         if "latents" not in scene.kept:
             scene.kept["latents"] = self.encode(self.params, scene.photos.images)
         known = scene.kept["latents"][np.array(choices.photos)]
         cond = self.program(model.condition, self.config)(self.params, known, features, views)
-        prepared = model.Prepared(known, jnp.zeros(()), cond, None)
+        lost = self.program(preview.lost_detail, self.config)(self.params, features, cond)
+        prepared = model.Prepared(known, jnp.zeros(()), cond, None, lost)
         noise = sampling.draw_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
         settings = dataclasses.replace(
             self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
@@ -183,7 +185,7 @@ class Engine:
         x0, _ = sampling.integrate(
             run, self.params, prepared, jnp.asarray(noise), grid, settings, self.config, bar
         )
-        return x0[m:]
+        return x0[m:], lost
 
 
 def rms(a: np.ndarray, b: np.ndarray) -> float:

@@ -80,7 +80,8 @@ grid = flow.schedule("shift", 8, shift=config.flow.shift)
 sample = jax.jit(functools.partial(rj.model.generate, config=config, solver=solvers.tabulate("euler", grid)))
 latents, info = sample(params, prepared, noise)
 solvers.raise_if_failed(info)
-video = jax.jit(functools.partial(rj.model.decode_video, config=config))(params, latents)
+decode = jax.jit(functools.partial(rj.model.decode_video, config=config))
+video = decode(params, latents, detail=prepared.detail)
 print("latents", latents.shape, "video", video.shape, "evaluations", int(info.evaluations))
 
 # %%

@@ -30,6 +30,7 @@ _MODULES = (
     "checkpoint",
     "sampling",
     "fusion",
+    "preview",
     "cost",
     "core",
     "geometry",

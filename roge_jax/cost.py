@@ -282,15 +282,16 @@ def estimate(
     scene_tokens = scene_tokens_read(config, m)
     rays = (size[0] // config.renderer.patch) * (size[1] // config.renderer.patch)
     tokens = tokens_per_slot(config) * slots
-    preview_encode = vae_encode(config.vae, n, config.height, config.width)
+    video_decode = vae_decode(config.vae, n, config.height, config.width)
+    both_ways = vae_encode(config.vae, n, config.height, config.width) + video_decode
     flops = {
         "encode photos (VAE)": m * vae_encode(config.vae, 1, config.height, config.width),
         "reconstruct": encoder(config.encoder, *size, m, config.renderer.width),
         "query rays": renderer(config.renderer, *size, scene_tokens, m, m + n),
         "condition": fusion(config, m + n, slots) + text(config.dit),
-        **({"encode preview (VAE)": preview_encode} if config.fusion.preview else {}),
+        **({"preview (VAE, both ways)": both_ways} if config.fusion.preview else {}),
         "velocity": velocity(config.dit, tokens),
-        "decode": vae_decode(config.vae, n, config.height, config.width),
+        "decode": video_decode,
     }
 
     def scores(queries: float, keys: float, heads: int) -> float:
@@ -310,7 +311,7 @@ def estimate(
         + scores(chunk * ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
-        **({"encode preview (VAE)": features + maps} if config.fusion.preview else {}),
+        **({"preview (VAE, both ways)": features + maps} if config.fusion.preview else {}),
         "velocity": features
         + scores(tokens, tokens, d.heads)
         + 4.0 * tokens * (6 * d.width + d.ffn),

@@ -171,7 +171,7 @@ class Evaluator:
         h, w = truth.shape[1:3]
         head = np.asarray(self.rgb(self.params, prepared.features[m:]))
         return {
-            "generated": np.asarray(self.decode(self.params, latents))[:n],
+            "generated": np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n],
             "rgb_head": np.stack([resize(image, h, w) for image in head[:n]]),
             "vae_round_trip": np.asarray(
                 self.decode(self.params, self.encode(self.params["vae"], 2.0 * truth - 1.0))

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import fusion
+from . import fusion, preview
 from .config import RoGeConfig
 from .core.layers import resized
 from .core.lora import attach, lora_specs
@@ -160,23 +160,15 @@ def encode_targets(params: Tree, target_rgb: jax.Array, *, config: RoGeConfig) -
     return vae.encode_any(params["vae"], 2.0 * target_rgb - 1.0, cfg=config.vae)
 
 
-def decode_video(params: Tree, latents: jax.Array, *, config: RoGeConfig) -> jax.Array:
-    """Target latents [t, lh, lw, 16] -> video [n, h, w, 3] in [0, 1]."""
-    return jnp.clip(0.5 + 0.5 * vae.decode(params["vae"], latents, cfg=config.vae), 0.0, 1.0)
+def decode_video(
+    params: Tree, latents: jax.Array, *, config: RoGeConfig, detail: jax.Array | None = None
+) -> jax.Array:
+    """Target latents [t, lh, lw, 16] -> video [n, h, w, 3] in [0, 1], in chunks of time if it is large.
 
-
-def preview_latents(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array | None:
-    """The RGB head's frames of the targets' ray features [n, gh, gw, d], encoded [1 + (n - 1) / 4, lh, lw, 16]; None
-    unless the model has `FusionConfig.preview`.
-
-    Not in the paper. A large pretrained transformer can learn to turn ray features into latents; a small one spends its
-    training on becoming a second encoder. No gradient passes: the features learn through G and the photometric term.
+    `detail` [n, h, w, 3] is added: what the VAE loses of the preview (`preview.lost_detail`).
     """
-    if not config.fusion.preview:
-        return None
-    frames = decode_rgb(params, jax.lax.stop_gradient(features), config=config)
-    frames = resized(frames, config.height, config.width)
-    return jax.lax.stop_gradient(encode_targets(params, frames, config=config))
+    video = 0.5 + 0.5 * vae.decode_any(params["vae"], latents, cfg=config.vae)
+    return jnp.clip(video if detail is None else video + detail, 0.0, 1.0)
 
 
 @jax.named_scope("condition")
@@ -189,11 +181,11 @@ def condition(
     config: RoGeConfig,
 ) -> Condition:
     """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views, contexts first."""
-    preview = preview_latents(params, features[context_latents.shape[0] :], config=config)
+    guess = preview.latents(params, features[context_latents.shape[0] :], config=config)
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
     features = fusion.standardised(features, config)
     return fusion.condition(
-        params["fusion"], context_latents, rays, features, preview, config.fusion.preview_std
+        params["fusion"], context_latents, rays, features, guess, config.fusion.preview_std
     )
 
 
@@ -229,22 +221,7 @@ def velocity(
         extra_tokens=cond.tokens,
         remat=remat,
     )
-    return about_preview(output, x, sigma, cond, contexts)
-
-
-def about_preview(
-    output: jax.Array, x: jax.Array, sigma: jax.Array, cond: Condition, contexts: int
-) -> jax.Array:
-    """The velocity that the transformer's `output` [t, lh, lw, 16] stands for at x.
-
-    Targets with a preview of known error: mean + deviation * output (`flow.velocity_about`), as Karras et al. (2022)
-    precondition a denoiser about 0. Everything else is the velocity itself.
-    """
-    if cond.spread is None:
-        return output
-    preview = cond.appearance[contexts:, ..., fusion.MASK_CHANNELS :]
-    mean, deviation = flow.velocity_about(preview, cond.spread, x[contexts:], sigma)
-    return jnp.concatenate([output[:contexts], mean + deviation * output[contexts:]])
+    return preview.velocity(output, x, sigma, cond, contexts)
 
 
 def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
@@ -380,6 +357,7 @@ class Prepared(NamedTuple):
     features: jax.Array  # [m + n, gh, gw, d]
     condition: Condition
     text: Tree | None
+    detail: jax.Array | None  # [n, h, w, 3], see `preview.lost_detail`
 
 
 def prepare(
@@ -391,7 +369,8 @@ def prepare(
     features = query_rays(params, scene_tokens, views, config=config)
     latents = encode_contexts(params, views["context_rgb"], config=config)
     cond = condition(params, latents, features, views, config=config)
-    return Prepared(latents, features, cond, text_cache(params, config=config))
+    detail = preview.lost_detail(params, features, cond, config=config)
+    return Prepared(latents, features, cond, text_cache(params, config=config), detail)
 
 
 def draw_noise(key: jax.Array, contexts: int, *, config: RoGeConfig) -> jax.Array:

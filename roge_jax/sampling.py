@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from . import cost, fields, limits, model
+from . import fields, limits, model
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
@@ -30,7 +30,7 @@ from .data.scene import Scene, distinct_views
 from .data.scene import prepare as prepare_photos
 from .errors import UserError, did_you_mean
 from .geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
-from .video import flow, solvers, vae
+from .video import flow, solvers
 from .windows import CHAIN_FRAMES, chain_views, chained, view_distance, window_views, windows
 
 __all__ = ["CHAIN_FRAMES", "chain_views", "chained", "view_distance", "window_views", "windows"]
@@ -180,7 +180,7 @@ class Programs(NamedTuple):
 
     prepare: Callable  # (params, views) -> Prepared
     velocity: Callable  # (params, prepared, noise, x, sigma) -> velocity
-    decode: Callable  # (params, x0) -> frames [n, h, w, 3]
+    decode: Callable  # (params, x0, detail) -> frames [n, h, w, 3]
     preview: Callable  # (params, features) -> [n, recon_h, recon_w, 3]
 
 
@@ -199,13 +199,9 @@ def velocity(
     return field(x if project is None else project(x, sigma), sigma)
 
 
-def decode(params, x0, *, config: RoGeConfig, contexts: int):
-    """Latents of a whole window [t, lh, lw, 16] -> frames; contexts are dropped. Chunked in time if it is large."""
-    latents = x0[contexts:]
-    if cost.decoder_tensor_bytes(config) <= cost.SINGLE_PASS_BYTES:
-        return model.decode_video(params, latents, config=config)
-    video = vae.decode_chunked(params["vae"], latents, cfg=config.vae)
-    return jnp.clip(0.5 + 0.5 * video, 0.0, 1.0)
+def decode(params, x0, detail, *, config: RoGeConfig, contexts: int):
+    """Latents of a whole window [t, lh, lw, 16] -> frames; contexts are dropped. `detail`: of `model.Prepared`."""
+    return model.decode_video(params, x0[contexts:], config=config, detail=detail)
 
 
 def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
@@ -241,7 +237,7 @@ def programs(
     arguments = {
         "prepare": (weights, seen),
         "velocity": (weights, prepared, state, state, sigma),
-        "decode": (weights, state),
+        "decode": (weights, state, prepared.detail),
         "preview": (weights, prepared.features),
     }
     # Tracing holds Python's lock, compiling does not.
@@ -383,7 +379,7 @@ def sample(
             x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
         with stage("decode"):
             # Copies: on a CPU a view would keep the device's array alive.
-            frames.append(np.array(run.decode(params, x0))[:n])
+            frames.append(np.array(run.decode(params, x0, prepared.detail))[:n])
             previews.append(np.array(run.preview(params, prepared.features))[:n])
         evaluations += count
     bar.close()

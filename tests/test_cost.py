@@ -216,11 +216,12 @@ class TestEstimate:
         assert SCORES_BYTES < 4 * 6804**2 * 40, "queries in pieces"
         assert plain - fused == SCORES_BYTES
 
-    def test_a_preview_costs_one_more_encoding(self):
+    def test_a_preview_costs_one_more_encoding_and_decoding(self):
         plain = preset("tiny")
         config = dataclasses.replace(plain, fusion=dataclasses.replace(plain.fusion, preview=True))
         with_, without = cost.estimate(config, 2, 8), cost.estimate(plain, 2, 8)
-        more = cost.vae_encode(plain.vae, plain.frames, plain.height, plain.width)
+        clip = plain.vae, plain.frames, plain.height, plain.width
+        more = cost.vae_encode(*clip) + cost.vae_decode(*clip)
         assert with_.total_flops == pytest.approx(without.total_flops + more)
         assert with_.working_bytes.keys() == with_.flops.keys()
 
@@ -244,7 +245,7 @@ class TestEstimate:
             )
 
         def decode(p, x):
-            return sampling.decode(p, x, config=config, contexts=1)
+            return sampling.decode(p, x, None, config=config, contexts=1)
 
         for name, function, arguments in (
             ("decode", decode, (p, state)),

@@ -25,14 +25,15 @@ ALLOWED = {
     "recon": _BASE,  # the three networks do not know one another
     "video": _BASE,
     "fusion": _BASE,
-    "model": _PARTS,
+    "preview": _PARTS,
+    "model": _PARTS | {"preview"},
     "weights": _PARTS,
     "data": _BASE | {"entry", "folders"},  # neither networks nor metrics; a program writes pools
     "metrics": _BASE,
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},
     "limits": _BASE,
-    "training": _PARTS | {"model", "weights", "data", "metrics", "checkpoint", "cost"},
+    "training": _PARTS | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost"},
     "windows": _PARTS | {"model"},
     "sampling": _PARTS | {"model", "data", "cost", "windows", "limits"},
     "planning": _PARTS | {"model", "data", "cost", "windows", "sampling"},

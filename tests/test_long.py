@@ -111,5 +111,7 @@ def test_nine_photos_81_frames_480x832_has_its_shapes():
         params, ready, x,
     )  # fmt: skip
     assert out.shape == x.shape
-    video = jax.eval_shape(lambda p, x: sampling.decode(p, x, config=cfg, contexts=m), params, x)
+    video = jax.eval_shape(
+        lambda p, x: sampling.decode(p, x, None, config=cfg, contexts=m), params, x
+    )
     assert video.shape == (81, 480, 832, 3)

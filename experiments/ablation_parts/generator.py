@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from roge_jax import fusion, model
+from roge_jax import fusion, model, preview
 from roge_jax.config import RoGeConfig
 from roge_jax.core.lora import attach
 from roge_jax.core.params import Tree, count, flatten, unflatten
@@ -53,8 +53,8 @@ def told(params: Tree, views: model.Views, features: jax.Array, *, config: RoGeC
         "features": fusion.standardised(features, config),
     }
     photos = views["context_rgb"].shape[0]
-    preview = model.preview_latents(params, features[photos:], config=config)
-    return found if preview is None else found | {"preview": preview}
+    latents = preview.latents(params, features[photos:], config=config)
+    return found if latents is None else found | {"preview": latents}
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -83,7 +83,12 @@ def flow_error(params: Tree, clip, noise, sigma, *, config: RoGeConfig, remat="n
     """
     x0, m = clip["x0"], clip["known"].shape[0]
     cond = fusion.condition(
-        params["fusion"], clip["known"], clip["rays"], clip["features"], clip.get("preview")
+        params["fusion"],
+        clip["known"],
+        clip["rays"],
+        clip["features"],
+        clip.get("preview"),
+        config.fusion.preview_std,
     )
     x = flow.x_sigma(jnp.concatenate([clip["seen"], x0[m:]]), noise, sigma)
     v = model.velocity(params, x, sigma, cond, config=config, contexts=m, remat=remat)

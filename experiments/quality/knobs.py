@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from roge_jax import config as configs
-from roge_jax import cost, fusion, model
+from roge_jax import cost, fusion, model, preview
 from roge_jax.config import RoGeConfig
 from roge_jax.core.params import flatten, unflatten
 from roge_jax.data.procedural import sample_sequence
@@ -49,7 +49,7 @@ def generation_only(scenes: Scenes, config: RoGeConfig) -> Scenes:
     """The same photos and noise, with neither rays nor ray features: `fusion.unconditioned`."""
     make = functools.partial(fusion.unconditioned, slots=config.slots(scenes.m), config=config)
     bare = jax.vmap(make)(scenes.prepared.context_latents)
-    return scenes._replace(prepared=scenes.prepared._replace(condition=bare))
+    return scenes._replace(prepared=scenes.prepared._replace(condition=bare, detail=None))
 
 
 def over_photos(params, config: RoGeConfig, sequences, known: dict[int, Scenes]) -> list[Record]:
@@ -228,7 +228,7 @@ def with_block_cache(params, config: RoGeConfig, scenes: Scenes, judge: Judge, e
                 change = blocks(first, slice(1, -1)) - first
             last = blocks(first + change, slice(-1, None))
             output = dit.head(p, last, e, grid=(t, rows, columns), patch=cfg.patch)
-            return model.about_preview(output, x, sigma, cond, m), change
+            return preview.velocity(output, x, sigma, cond, m), change
 
         return jax.vmap(one)(prepared, noise, x, change)
 
@@ -328,4 +328,6 @@ def round_trip(params, config: RoGeConfig, scenes: Scenes, judge: Judge) -> Reco
     """The truth through the VAE and back: what no sampler can beat."""
     encode = jax.jit(functools.partial(model.encode_targets, config=config))
     latents = jnp.stack([encode(params, truth) for truth in scenes.truth])
-    return record("ceiling", "VAE round trip", "truth", judge.scores(judge.frames(latents)))
+    return record(
+        "ceiling", "VAE round trip", "truth", judge.scores(judge.frames(latents, generated=False))
+    )

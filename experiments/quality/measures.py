@@ -39,9 +39,10 @@ class Judge:
             for depth, K, c2w in zip(scenes.depth, scenes.K, scenes.c2w)
         ]
 
-    def frames(self, latents: jax.Array) -> np.ndarray:
-        """[s, t, lh, lw, 16] -> [s, n, h, w, 3] in [0, 1]."""
-        return np.asarray(self._decode(self.params, latents))
+    def frames(self, latents: jax.Array, *, generated: bool = True) -> np.ndarray:
+        """[s, t, lh, lw, 16] -> [s, n, h, w, 3] in [0, 1]; what is not `generated` gets no detail of the preview."""
+        detail = self.scenes.prepared.detail if generated else None
+        return np.asarray(self._decode(self.params, latents, detail))
 
     def scores(self, frames: np.ndarray) -> dict[str, list[float]]:
         """{metric: one number a scene}"""
@@ -66,8 +67,10 @@ class Judge:
 
 @functools.cache
 def _decoder(config: RoGeConfig):
-    decode = functools.partial(model.decode_video, config=config)
-    return jax.jit(jax.vmap(decode, in_axes=(None, 0)))
+    def decode(params, latents, detail):
+        return model.decode_video(params, latents, config=config, detail=detail)
+
+    return jax.jit(jax.vmap(decode, in_axes=(None, 0, 0)))
 
 
 def same_surface(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> list[tuple]:

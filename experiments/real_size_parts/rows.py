@@ -186,7 +186,7 @@ def job(row: Row, dtype: Any) -> Job:
     if row.group == "vae":
         run = functools.partial(sampling.decode, config=cfg, contexts=m)
         flops = cost.vae_decode(cfg.vae, n, cfg.height, cfg.width)
-        return compiled(run, pick("vae"), noise, flops=flops)
+        return compiled(run, pick("vae"), noise, None, flops=flops)
     if row.group == "sample":
         return whole_video(cfg, m, pick(*specs), views, noise)
     assert row.group == "train", row.group
@@ -208,7 +208,10 @@ def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise
         ):
             x = state
         return jax.block_until_ready(
-            (run.decode(params, x), run.preview(params, prepared.features))
+            (
+                run.decode(params, x, prepared.detail),
+                run.preview(params, prepared.features),
+            )
         )
 
     return Job(call, cost.estimate(cfg, m, 50).total_flops, seconds)

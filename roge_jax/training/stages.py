@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import fusion, model
+from .. import fusion, model, preview
 from ..config import RoGeConfig
 from ..core.lora import attach
 from ..core.params import Tree
@@ -276,7 +276,7 @@ def measure_preview(
 ) -> tuple[Tree, RoGeConfig]:
     """(params, config) with the preview's root mean square error per latent channel on training clips.
 
-    What the transformer says means another thing from here on (`model.about_preview`), so its head starts from zero:
+    What the transformer says means another thing from here on (`preview.velocity`), so its head starts from zero:
     until it is trained it generates the preview and noise of that size.
     """
 
@@ -284,8 +284,8 @@ def measure_preview(
         m = views["context_rgb"].shape[0]
         tokens = model.reconstruct(params, views, config=config)
         features = model.query_rays(params, tokens, views, config=config)
-        preview = model.preview_latents(params, features[m:], config=config)
-        return model.encode_targets(params, views["target_rgb"], config=config) - preview
+        guess = preview.latents(params, features[m:], config=config)
+        return model.encode_targets(params, views["target_rgb"], config=config) - guess
 
     values = _on_clips(error, params, source, config, seed, clips)
     rms = np.sqrt(np.square(values).mean(0))

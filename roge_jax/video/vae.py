@@ -389,3 +389,10 @@ def decode_chunked(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 
     _, rest = jax.lax.scan(step, past, z[1:, None])
     return jnp.concatenate([first, rest.reshape(-1, *first.shape[1:])])
+
+
+def decode_any(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
+    """`decode`, or `decode_chunked` where a single pass would take too much memory."""
+    t, lh, lw, _ = latents.shape
+    large = largest_map((1 + 4 * (t - 1), 8 * lh, 8 * lw), cfg) > SINGLE_PASS_BYTES
+    return (decode_chunked if large else decode)(p, latents, cfg=cfg)
