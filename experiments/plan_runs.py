@@ -113,7 +113,7 @@ class Engine:
 
     def __init__(self, params, config):
         self.params, self.config = params, config
-        self.settings = sampling.Settings()
+        self.settings = sampling.Settings().of(config)
         self.programs: dict = {}
         self.velocity = jax.jit(functools.partial(sampling.velocity, config=config, slots="noised"))
         self.decode = jax.jit(functools.partial(sampling.decode, config=config, contexts=0))
@@ -194,26 +194,24 @@ def rms(a: np.ndarray, b: np.ndarray) -> float:
 
 # ---- calibration -----------------------------------------------------------------------------------
 
-WAYS = [("ab2", "uniform", k) for k in (2, 3, 4, 6)]
-WAYS += [("unipc_2", "uniform", k) for k in (1, 2, 3, 4)] + [("unipc_2", "shift", 4)]
-BASE = {"steps": 4}  # where photos, tokens and size are compared: their effect, not that of steps
 
-
-def stored_ways(name: str) -> list[tuple[str, str, int]]:
-    """Optimised schedules of the model, at most 6 evaluations."""
-    return [
-        (solver, "optimised", steps)
-        for solver, grids in flow.optimised_grids(name).items()
-        for steps in grids
-        if solvers.nfe(solver, steps) <= 6
-    ]
+def ways(engine: Engine) -> list[tuple[str, str, int]]:
+    """(solver, schedule, steps) with fewer evaluations than the full model, and at most 6."""
+    own = engine.settings
+    found = [(own.solver, own.schedule, k) for k in range(1, own.steps)]
+    found += [("unipc_2", "uniform", k) for k in range(1, own.steps)]
+    stored = flow.optimised_grids(engine.config.name)
+    found += [(solver, "optimised", k) for solver, grids in stored.items() for k in grids]
+    most = min(6, solvers.nfe(own.solver, own.steps) - 1)
+    return [way for way in found if solvers.nfe(way[0], way[2]) <= most]
 
 
 def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     """Errors of one knob at a time on one scene, and its proxies."""
     full = engine.choices(scene)
     reference = engine.run(scene, full)
-    base = dataclasses.replace(full, **BASE)
+    # Where photos, tokens and size are compared: their effect, not that of steps.
+    base = dataclasses.replace(full, steps=max(1, full.steps // 2))
     head = dataclasses.replace(full, generate=(False,))
     small = proxies.half_size(engine.config)
 
@@ -229,7 +227,7 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     row["head"] = rms(engine.run(scene, head), reference)
     row["steps"] = [
         [*way, rms(engine.run(scene, dataclasses.replace(full, solver=way[0], schedule=way[1], steps=way[2])), reference)]
-        for way in [*WAYS, *stored_ways(engine.config.name)]
+        for way in ways(engine)
     ]  # fmt: skip
     row["merge"] = {merge: both(merge=merge) for merge in MERGES[1:]}
     row["half"] = both(recon=(small.recon_height, small.recon_width))

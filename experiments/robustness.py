@@ -182,7 +182,7 @@ class Runner:
     def __init__(self, name: str):
         self.params, self.config = checkpoint.load_model(name)
         self.programs: dict[int, sampling.Programs] = {}
-        self.settings = sampling.Settings()
+        self.settings = sampling.Settings().of(self.config)
 
     def videos(self, case: Case) -> dict[str, np.ndarray]:
         size = (self.config.height, self.config.width)

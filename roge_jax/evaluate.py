@@ -34,9 +34,9 @@ def parser() -> argparse.ArgumentParser:
         help=f"scene folders, 'motorcycle', procedural:SEED or procedural:FIRST..LAST\n(default: {HELD_OUT})",
     )
     p.add_argument("--context", type=number(1), default=3, help="photos per scene (default: 3)")
-    p.add_argument("--steps", type=number(1), default=20, help="sampling steps (default: 20)")
-    p.add_argument("--solver", default="euler", help="sampler (default: euler)")
-    p.add_argument("--schedule", default="shift", help="noise levels of the steps (default: shift)")
+    p.add_argument("--steps", type=number(1), help="sampling steps (default: the model's own)")
+    p.add_argument("--solver", help="sampler (default: the model's own)")
+    p.add_argument("--schedule", help="noise levels of the steps (default: the model's own)")
     p.add_argument("--seed", type=number(0), default=0, help="seed of the noise")
     p.add_argument(
         "--sweep",
@@ -125,8 +125,9 @@ class Evaluator:
     """The model's jitted pieces, compiled once for all scenes of a size."""
 
     def __init__(
-        self, checkpoint: str, solver: str, steps: int, seed: int, schedule: str = "shift"
+        self, checkpoint: str, solver: str = "", steps: int = 0, seed: int = 0, schedule: str = ""
     ):
+        """Solver, steps and schedule are the model's own if not given (`sampling.Settings`)."""
         import functools
 
         import jax
@@ -137,10 +138,11 @@ class Evaluator:
 
         self.params, self.config = load_model(checkpoint)
         config = self.config
+        self.settings = s = sampling.Settings(steps, solver, schedule).of(config)
         grid = flow.schedule(
-            schedule, steps, shift=config.flow.shift, solver=solver, model=config.name
+            s.schedule, s.steps, shift=config.flow.shift, solver=s.solver, model=config.name
         )
-        table = solvers.tabulate(solver, grid)
+        table = solvers.tabulate(s.solver, grid)
         self.prepare = jax.jit(functools.partial(model.prepare, config=config))
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
@@ -195,7 +197,9 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         raise UserError(f"--scenes names '{min(twice)}' twice: give every scene once.")
     if args.sweep and not args.sweep[0] <= args.sweep[1]:
         raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
-    evaluator = Evaluator(args.checkpoint, args.solver, args.steps, args.seed, args.schedule)
+    evaluator = Evaluator(
+        args.checkpoint, args.solver or "", args.steps or 0, args.seed, args.schedule or ""
+    )
     config = evaluator.config
     size = (config.height, config.width)
     results, rows, methods = [], [], []
@@ -235,9 +239,9 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "size": list(size),
         "context": args.context,
         "frames": config.frames,
-        "solver": args.solver,
-        "steps": args.steps,
-        "schedule": args.schedule,
+        "solver": evaluator.settings.solver,
+        "steps": evaluator.settings.steps,
+        "schedule": evaluator.settings.schedule,
         "seed": args.seed,
         "sweep": args.sweep,
         "metrics": image.SETTINGS,

@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
-    from .sampling import LONG, SCHEDULE, SLOTS, SOLVER, STEPS
+    from .sampling import LONG, SLOTS
     from .video.flow import SCHEDULES
     from .video.solver_table import SOLVERS
 
@@ -46,7 +46,7 @@ def parser() -> argparse.ArgumentParser:
         shown = "" if default is None else f" (default: {default})"
         p.add_argument(name, default=default, help=help + shown, **more)
 
-    real = number(1e-30, whole=False)
+    real, own = number(1e-30, whole=False), "; the model's own if not given"
     option("--checkpoint", "model folder, or the name of a shipped one", "mini")
     option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", "motorcycle")
     paths = ", ".join(sorted(PRESETS))
@@ -55,9 +55,9 @@ def parser() -> argparse.ArgumentParser:
     )
     option("--trajectory", path_help, TRAJECTORY, metavar="NAME|FILE")
     option("--frames", "length of the path; the model's window, or the file's own", type=number(1))
-    option("--steps", "sampling steps", STEPS, type=number(1))
-    option("--solver", ", ".join(SOLVERS), SOLVER, type=one_of(SOLVERS))
-    option("--schedule", ", ".join(SCHEDULES), SCHEDULE, type=one_of(SCHEDULES))
+    option("--steps", f"sampling steps{own}", type=number(1))
+    option("--solver", f"{', '.join(SOLVERS)}{own}", type=one_of(SOLVERS))
+    option("--schedule", f"{', '.join(SCHEDULES)}{own}", type=one_of(SCHEDULES))
     option("--seed", "seed of the noise: same seed, same frames", 0, type=number(0))
     option("--out", "output folder", Path("outputs/sample"), type=Path)
     ids_help = (
@@ -322,9 +322,9 @@ def main(args: argparse.Namespace) -> None:
     from .core import sharding
 
     settings = sampling.Settings(
-        steps=args.steps,
-        solver=args.solver,
-        schedule=args.schedule,
+        steps=args.steps or 0,
+        solver=args.solver or "",
+        schedule=args.schedule or "",
         seed=args.seed,
         slots=args.context_slots,
         long=args.long,
@@ -336,6 +336,7 @@ def main(args: argparse.Namespace) -> None:
 
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
+    settings = settings.of(config)
     with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
             scene = load_scene(args.scene, convention=args.convention)
@@ -390,6 +391,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     from .video import solvers
 
     config = model_config(args, weights=False)
+    settings = settings.of(config)
     if args.context is not None and args.context.isdecimal():
         m = int(args.context)
         if not 1 <= m <= config.max_context:

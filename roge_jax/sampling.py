@@ -35,9 +35,6 @@ from .windows import CHAIN_FRAMES, chain_views, chained, view_distance, window_v
 
 __all__ = ["CHAIN_FRAMES", "chain_views", "chained", "view_distance", "window_views", "windows"]
 
-# The defaults of `python -m roge_jax.sample`: as good as 50 Euler steps on the shipped model (docs/solvers.md). Not an
-# optimised schedule, which only some models have.
-SOLVER, STEPS, SCHEDULE = "ab2", 8, "uniform"
 LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
@@ -46,11 +43,11 @@ Stage = Callable[[str], AbstractContextManager]
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How to sample; all of it goes into run.json."""
+    """How to sample; all of it goes into run.json. Steps 0, no solver, no schedule: the model's own (`of`)."""
 
-    steps: int = STEPS
-    solver: str = SOLVER
-    schedule: str = SCHEDULE
+    steps: int = 0
+    solver: str = ""
+    schedule: str = ""
     seed: int = 0
     slots: flow.ContextSlots = "noised"
     long: Literal["chain", "independent"] = "chain"
@@ -58,7 +55,7 @@ class Settings:
 
     def __post_init__(self):
         for name, word, allowed in (
-            ("solver", self.solver, tuple(solvers.SOLVERS)),
+            ("solver", self.solver or "euler", tuple(solvers.SOLVERS)),
             ("context slots", self.slots, SLOTS),
             ("long", self.long, LONG),
         ):
@@ -68,7 +65,17 @@ class Settings:
         if self.scale is not None:
             fields.number(self.scale, "Settings", "scale", low=1e-30)
         if self.schedule != "optimised":  # those belong to a model, which `sample` knows
-            flow.schedule(self.schedule, self.steps, solver=self.solver)
+            flow.schedule(self.schedule or "uniform", self.steps or 1)
+
+    def of(self, config: RoGeConfig) -> "Settings":
+        """These settings with what they leave open as the model's configuration has it."""
+        own = config.flow
+        return dataclasses.replace(
+            self,
+            steps=self.steps or own.steps,
+            solver=self.solver or own.solver,
+            schedule=self.schedule or own.schedule,
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,7 +308,7 @@ def sample(
     """
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
-    given, unplanned = len(photos.ids), config
+    given, unplanned, settings = len(photos.ids), config, settings.of(config)
     _check_photos(photos, config)
     if plan is not None:
         if max(plan.choices.photos, default=0) >= given:

@@ -16,7 +16,10 @@ from quality import charts, knobs
 from quality.measures import GAP, consistency, same_surface
 from quality.scenes import CONTEXTS, most_steps, photos
 
+from roge_jax.config import FlowConfig
 from roge_jax.video.solvers import nfe
+
+OWN = FlowConfig()
 
 
 def test_photos_are_spread_and_targets_are_the_same_for_every_number_of_photos():
@@ -83,14 +86,14 @@ def test_goals_are_two_sided_and_a_blurred_point_never_wins():
     blurred = point("euler", 2, 0.4, 1.2, 0.35)  # more PSNR by blur
     coarse = point("ab2", 4, 0.05, 0.3, 0.48)
     fine = point("ab2", 8, 0.01, 0.05, 0.5)
-    found = verdict([blurred, coarse, fine], euler)
+    found = verdict([blurred, coarse, fine], euler, OWN)
     assert [g["point"] for g in found["goals"]] == ["ab2 uniform 8", "ab2 uniform 4"]
     assert [g["reached"] for g in found["goals"]] == [True, True]
     assert found["fewest_evaluations_within_goal"] == "ab2 uniform 8"
-    alone = verdict([blurred], euler)
+    alone = verdict([blurred], euler, OWN)
     assert not any(g["reached"] for g in alone["goals"])
     assert "fewest_evaluations_within_goal" not in alone
-    edge = verdict([point("ab2", 4, 0.05, 0.495, 0.5)], euler)["goals"][1]
+    edge = verdict([point("ab2", 4, 0.05, 0.495, 0.5)], euler, OWN)["goals"][1]
     assert edge["reached"] and not edge["reached_by_interval"]
 
 
@@ -111,7 +114,7 @@ def test_tables_replace_only_what_lies_between_the_markers():
         "reference": {"self_error": euler["metrics"], "metrics": euler["metrics"]},
         "euler50": {"metrics": euler["metrics"], "seconds": 1.0},
         "records": records,
-        "verdict": verdict(records, euler["metrics"]),
+        "verdict": verdict(records, euler["metrics"], OWN),
         "knobs": [],
     }
     text = "before\n<!-- mini_quality: written by the experiment -->\nold\n<!-- /mini_quality -->\nafter\n"

@@ -20,7 +20,7 @@ from roge_jax.planning.options import full_choices, list_options
 from roge_jax.recon.ray_scene import attend, merge_scene
 
 CONFIG = preset("tiny")
-SETTINGS = sampling.Settings(steps=12)
+SETTINGS = sampling.Settings(steps=12).of(CONFIG)
 # Made-up constants, so that no test depends on how the shipped model was measured.
 TABLE = table.parse(
     "tiny",

@@ -120,7 +120,7 @@ def test_latents_left_as_they_are_come_out_as_the_reconstructions_own_picture(sh
     # Another latent changes the picture by what the VAE makes of the difference.
     other = left + 0.002 * jax.random.normal(jax.random.key(2), left.shape)
     change = decode(other, detail=detail) - decode(left, detail=detail)
-    middle = [(0.2 < x) & (x < 0.8) for x in (shown, blurred)]
+    middle = [(x > 0.2) & (x < 0.8) for x in (shown, blurred)]
     inside = middle[0] & middle[1]
     assert inside.any()
     np.testing.assert_allclose(change[inside], (decode(other) - blurred)[inside], atol=2e-5)

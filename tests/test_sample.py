@@ -1,5 +1,6 @@
 """Photos to video through the program itself, on the tiny model with random weights and a scene written here."""
 
+import dataclasses
 import json
 
 import jax
@@ -206,7 +207,7 @@ def test_program_agrees_with_the_model_file(weights, photos):
     context, target, info = normalise(photos.cameras, path)
     views = sampling.window_views(photos.images, None, context, target, info, CONFIG)
     noise = sampling.draw_noise(0, 0, 4, CONFIG)
-    grid = sampling.flow.schedule(SETTINGS.schedule, 2)
+    grid = sampling.flow.schedule(SETTINGS.of(CONFIG).schedule, 2)
 
     @jax.jit
     def plain(params, views, noise):
@@ -217,6 +218,18 @@ def test_program_agrees_with_the_model_file(weights, photos):
         return model.decode_video(params, latents, config=CONFIG)
 
     np.testing.assert_allclose(ours.frames, plain(weights, views, noise), atol=2e-4)
+
+
+def test_what_settings_leave_open_is_the_models_own(weights, photos):
+    own = dataclasses.replace(CONFIG.flow, solver="midpoint", steps=3, schedule="graded")
+    theirs = dataclasses.replace(CONFIG, flow=own)
+    assert sampling.Settings(seed=4).of(theirs) == sampling.Settings(3, "midpoint", "graded", 4)
+    assert sampling.Settings(2, "euler", "shift").of(theirs) == sampling.Settings(
+        2, "euler", "shift"
+    )
+    path = make_path("orbit", photos.cameras, 1)
+    for settings, evaluations in ((sampling.Settings(), 6), (sampling.Settings(steps=1), 2)):
+        assert sampling.sample(weights, theirs, photos, path, settings).evaluations == evaluations
 
 
 def test_adaptive_solver(weights, photos):
@@ -425,9 +438,12 @@ def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
         == 0
     )
     shown = capsys.readouterr().out
-    assert (
-        said in shown and f"velocity, each of {sampling.STEPS}" in shown and "peak memory" in shown
+    steps = (
+        checkpoint.load_config(checkpoint.find_model(name)).flow.steps
+        if name == "mini"
+        else preset(name).flow.steps
     )
+    assert said in shown and f"velocity, each of {steps}" in shown and "peak memory" in shown
     assert not any(tmp_path.iterdir())
 
 

@@ -20,7 +20,6 @@ from roge_jax.config import RoGeConfig
 from roge_jax.core.params import flatten, unflatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.metrics import baselines
-from roge_jax.sampling import SCHEDULE, SOLVER, STEPS
 from roge_jax.video import dit, flow
 
 from .measures import Judge, difference, summary
@@ -29,11 +28,12 @@ from .scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos, prep
 Record = dict[str, Any]
 PHOTOS = tuple(range(1, CONTEXTS + 1))
 SIZES = ((48, 80), (64, 112), (96, 160))
-PEER_STEPS = (2, 4, 6, 8, 12, 20, 50)
+PEER_STEPS = (1, 2, 4, 6, 8, 12, 20, 50)
 
 
 def default_run(sampler: Sampler, velocity: Any = None):
-    return sampler.run(SOLVER, sampler.grid(SCHEDULE, STEPS, SOLVER), velocity)
+    own = sampler.config.flow
+    return sampler.run(own.solver, sampler.grid(own.schedule, own.steps, own.solver), velocity)
 
 
 def sampled(params, config: RoGeConfig, scenes: Scenes) -> tuple[Record, dict[str, list[float]]]:
@@ -101,10 +101,10 @@ def over_steps(params, config: RoGeConfig, scenes: Scenes) -> list[Record]:
     """The generation-only model along the number of steps."""
     bare = generation_only(scenes, config)
     sampler, judge = Sampler(params, bare, config), Judge(params, config, bare)
-    records = []
+    records, own = [], config.flow
     for steps in PEER_STEPS:
-        schedule = SCHEDULE if SCHEDULE != "optimised" or steps == STEPS else "uniform"
-        run = sampler.run(SOLVER, sampler.grid(schedule, steps, SOLVER))
+        schedule = own.schedule if own.schedule != "optimised" or steps == own.steps else "uniform"
+        run = sampler.run(own.solver, sampler.grid(schedule, steps, own.solver))
         scores = judge.scores(judge.frames(run.latents))
         more = {"seconds": run.seconds, "evaluations": run.evaluations, "schedule": schedule}
         records.append(record("steps", steps, "generation only", scores, **more))
@@ -238,7 +238,11 @@ def with_block_cache(params, config: RoGeConfig, scenes: Scenes, judge: Judge, e
     start = (params, scenes.prepared, scenes.noise, scenes.noise, jnp.float32(1.0), tokens)
     for compiled in fields.values():
         compiled(*start)[0].block_until_ready()
-    for solver, schedule, steps in (("euler", "shift", 50), (SOLVER, SCHEDULE, STEPS)):
+    own = config.flow
+    for solver, schedule, steps in (
+        ("euler", "uniform", 50),
+        (own.solver, own.schedule, own.steps),
+    ):
         kept = {"calls": 0, "change": tokens}
 
         def velocity(x, sigma, kept=kept):

@@ -35,6 +35,7 @@ class Option(NamedTuple):
 
 def full_choices(photos: Photos, config: RoGeConfig, path: Cameras, settings: Settings) -> Choices:
     """Nothing left out."""
+    settings = settings.of(config)
     return Choices(
         photos=tuple(range(len(photos.ids))),
         steps=settings.steps,
@@ -56,6 +57,7 @@ def list_options(
     worth: np.ndarray | None,
 ) -> list[Option]:
     """All combinations of the knobs with predicted errors and FLOPs; the full model alone if `worth` is None."""
+    settings = settings.of(config)
     full = full_choices(photos, config, path, settings)
     parts = windows(len(path), config.frames)
     spans = np.array([stop - start for start, stop in parts]) / len(path)

@@ -111,7 +111,7 @@ def plan(
     Raises: UserError for values that make no sense and for a `max_cost` below the cheapest plan.
     """
     _check(tolerance, max_cost)
-    settings = Settings() if settings is None else settings
+    settings = (Settings() if settings is None else settings).of(config)
     photos = scene if isinstance(scene, Photos) else photos_of(scene, config, context)
     full = full_choices(photos, config, path, settings)
     table = load(config.name) if table is None else table
