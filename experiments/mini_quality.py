@@ -163,8 +163,9 @@ def main(args: argparse.Namespace) -> None:
         "reference": base["reference"],
         "frames": base["frames"],
     }
-    others = knobs.over_photos(params, config, sequences, {DEFAULT_M: scenes})
-    others += knobs.over_steps(params, config, scenes)
+    peer = load_model(args.generation_only)[0] if args.generation_only else params
+    others = knobs.over_photos(params, config, sequences, {DEFAULT_M: scenes}, peer)
+    others += knobs.over_steps(peer, config, scenes)
     others += knobs.over_sizes(params, config, seeds)
     others += knobs.in_bfloat16(params, config, scenes, exact)
     others += knobs.with_block_cache(params, config, scenes, judge, exact)
@@ -188,6 +189,9 @@ def main(args: argparse.Namespace) -> None:
             "schedules_are_of_these_weights": found == weights,
             "command": " ".join(["python experiments/mini_quality.py", *sys.argv[1:]]),
             "scenes": [seeds[0], seeds[-1]],
+            "generation_only": Path(args.generation_only).parent.name
+            if args.generation_only
+            else "",
             "photos": DEFAULT_M,
             "size": [config.height, config.width, config.frames],
             "reference": f"rk4, {args.reference} graded steps",
@@ -239,6 +243,11 @@ if __name__ == "__main__":
     parser.add_argument("--solvers", nargs="+", default=list(ALL_SOLVERS), choices=ALL_SOLVERS)
     parser.add_argument("--budgets", nargs="+", type=int, default=list(BUDGETS))
     parser.add_argument("--reference", type=int, default=64, help="steps of the reference")
+    parser.add_argument(
+        "--generation-only",
+        metavar="FOLDER",
+        help="a model of the stage `prior` as the generation-only peer; without it this model, told of no rays",
+    )
     parser.add_argument("--draw", action="store_true", help="charts and tables from the JSON alone")
     chosen = parser.parse_args()
     if chosen.scenes < 2:

@@ -145,7 +145,13 @@ def test_the_experiment_runs_from_weights_to_document(tmp_path, monkeypatch):
     monkeypatch.setattr(knobs, "PHOTOS", (3,))
     monkeypatch.setattr(knobs, "SIZES", ((48, 80),))
     monkeypatch.setattr(knobs, "PEER_STEPS", (2,))
-    args = {"checkpoint": "mini", "scenes": 2, "solvers": ["euler"], "budgets": [4, 8]}
+    args = {
+        "checkpoint": "mini",
+        "scenes": 2,
+        "solvers": ["euler"],
+        "budgets": [4, 8],
+        "generation_only": None,
+    }
     mini_quality.main(argparse.Namespace(**args, reference=8))
     report = json.loads((tmp_path / "mini_quality.json").read_text())
     assert {r["evaluations"] for r in report["records"] if r["solver"] == "euler"} == {4, 8}

@@ -52,8 +52,12 @@ def generation_only(scenes: Scenes, config: RoGeConfig) -> Scenes:
     return scenes._replace(prepared=scenes.prepared._replace(condition=bare, detail=None))
 
 
-def over_photos(params, config: RoGeConfig, sequences, known: dict[int, Scenes]) -> list[Record]:
-    """M = 1 .. 6: the model, the generation-only model, the RGB head and the baselines, on the same targets."""
+def over_photos(
+    params, config: RoGeConfig, sequences, known: dict[int, Scenes], peer
+) -> list[Record]:
+    """M = 1 .. 6: the model, the generation-only model (parameters `peer`), the RGB head and the baselines, on the same
+    targets.
+    """
     records = []
     rgb = jax.jit(jax.vmap(functools.partial(model.decode_rgb, config=config), in_axes=(None, 0)))
     for m in PHOTOS:
@@ -65,11 +69,11 @@ def over_photos(params, config: RoGeConfig, sequences, known: dict[int, Scenes])
         prepare(params, one).features.block_until_ready()
         prepare_seconds = time.perf_counter() - began
         judge = Judge(params, config, scenes)
-        for method, batch in (
-            ("generated", scenes),
-            ("generation only", generation_only(scenes, config)),
+        for method, weights, batch in (
+            ("generated", params, scenes),
+            ("generation only", peer, generation_only(scenes, config)),
         ):
-            more, scores = sampled(params, config, batch)
+            more, scores = sampled(weights, config, batch)
             records.append(record("M", m, method, scores, prepare_seconds=prepare_seconds, **more))
         heads = np.asarray(rgb(params, scenes.prepared.features))[:, m:]
         records.append(record("M", m, "RGB head", judge.scores(heads)))
@@ -97,10 +101,10 @@ def simple(scenes: Scenes) -> dict[str, np.ndarray]:
     return {name: np.asarray(frames, np.float32) for name, frames in found.items()}
 
 
-def over_steps(params, config: RoGeConfig, scenes: Scenes) -> list[Record]:
+def over_steps(peer, config: RoGeConfig, scenes: Scenes) -> list[Record]:
     """The generation-only model along the number of steps."""
     bare = generation_only(scenes, config)
-    sampler, judge = Sampler(params, bare, config), Judge(params, config, bare)
+    sampler, judge = Sampler(peer, bare, config), Judge(peer, config, bare)
     records, own = [], config.flow
     for steps in PEER_STEPS:
         schedule = own.schedule if own.schedule != "optimised" or steps == own.steps else "uniform"
