@@ -7,7 +7,8 @@ CPU. The numbers are scenes (calibration) and scenes per rung; about 15 s of one
 Calibrate again whenever the weights change: the second command predicts with what the first one measured.
 
 The ladder has six rungs: a textured plane, the empty room or ground, 3, 6 and 12 objects, and 12 thin objects crowded
-around the focus. A seed has the same cameras and textures on every rung. Six photos, 17 targets between them, 64x112.
+around the focus. A seed has the same cameras and textures on every rung. Six photos and 17 targets of one path, 64x112:
+even seeds have their photos evenly spread, odd ones in two bursts of three, as people hold the shutter.
 Calibration uses training seeds (rung by rung in turn), the ladder held-out seeds with textures never trained on.
 
 For every tolerance and scene the planner (`roge_jax.planning`) makes a plan; its FLOPs include those of planning.

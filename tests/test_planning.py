@@ -2,6 +2,7 @@
 
 import dataclasses
 import types
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -374,6 +375,18 @@ def test_what_costs_more_than_its_share_is_not_measured(make):
     assert bought.planning_cost == price and "leave_one_out" in bought.measured
     free = make(0.05, probe=0.999 * price / full)
     assert free.planning_cost == 0.0 and list(free.measured) == ["detail"]
+
+
+def test_photos_of_the_ladder_are_spread_or_bursts(monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "experiments"))
+    from plan_runs import CONTEXTS, taken
+
+    for seed in range(40):
+        photos = taken(23, seed)
+        gaps = np.diff(photos)
+        assert len(photos) == CONTEXTS and photos[0] >= 0 and photos[-1] < 23 and np.all(gaps > 0)
+        assert (seed % 2 == 1) == (sorted(gaps)[:4] == [1, 1, 1, 1])
+    assert len({tuple(taken(23, seed)) for seed in range(1, 40, 2)}) > 10
 
 
 def test_the_shipped_table_says_where_it_comes_from():
