@@ -13,13 +13,15 @@ from roge_jax import fusion, model, preview
 from roge_jax.video import flow
 
 
+def shrunk(config, factor):
+    """The same model with smaller reconstruction images, in whole patches."""
+    height, width = config.recon_height // factor, -(-config.recon_width // factor // 8) * 8
+    return dataclasses.replace(config, recon_height=height, recon_width=width)
+
+
 @pytest.mark.parametrize("shrink", [1, 2], ids=["same size", "half size"])
 def test_the_preview_stands_where_the_targets_have_zeros(shrink):
-    config = dataclasses.replace(
-        PREVIEW,
-        recon_height=PREVIEW.recon_height // shrink,
-        recon_width=-(-PREVIEW.recon_width // shrink // 8) * 8,
-    )
+    config = shrunk(PREVIEW, shrink)
     known, features, views = made_condition(config)
     cond = model.condition(whole(), known, features, views, config=config)
     frames = model.decode_rgb(whole(), features[M:], config=config)
@@ -103,11 +105,7 @@ def test_about_a_preview_the_transformer_corrects_in_units_of_its_error():
 
 @pytest.mark.parametrize("shrink", [1, 2], ids=["same size", "half size"])
 def test_latents_left_as_they_are_come_out_as_the_reconstructions_own_picture(shrink):
-    config = dataclasses.replace(
-        ABOUT,
-        recon_height=ABOUT.recon_height // shrink,
-        recon_width=-(-ABOUT.recon_width // shrink // 8) * 8,
-    )
+    config = shrunk(ABOUT, shrink)
     known, features, views = made_condition(config)
     cond = model.condition(whole(), known, features, views, config=config)
     detail = preview.lost_detail(whole(), features, cond, config=config)
