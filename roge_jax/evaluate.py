@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .entry import number
+from .entry import number, one_of
 from .errors import UserError
 from .folders import output_file
 
@@ -21,6 +21,8 @@ HELD_OUT = "procedural:1000000000..1000000049"
 
 def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.evaluate`."""
+    from .geometry.cameras import CONVENTIONS
+
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.evaluate",
         description=__doc__,
@@ -37,6 +39,11 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--steps", type=number(1), help="sampling steps (default: the model's own)")
     p.add_argument("--solver", help="sampler (default: the model's own)")
     p.add_argument("--schedule", help="noise levels of the steps (default: the model's own)")
+    p.add_argument(
+        "--convention",
+        type=one_of(CONVENTIONS),
+        help=f"axes of the poses of a transforms.json that are not OpenGL: {', '.join(CONVENTIONS)}",
+    )
     p.add_argument("--seed", type=number(0), default=0, help="seed of the noise")
     p.add_argument(
         "--sweep",
@@ -84,7 +91,14 @@ def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]
     return context, [i for i in range(start, start + run) if i not in context]
 
 
-def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) -> dict[str, Any]:
+def read(
+    name: str,
+    contexts: int,
+    frames: int,
+    size: tuple[int, int],
+    sweep,
+    convention: str | None = None,
+) -> dict[str, Any]:
     """One scene at generation size: rgb [v, h, w, 3], K, c2w (float64), contexts first, and depth or None."""
     from .data import scene as scenes
 
@@ -108,7 +122,7 @@ def read(name: str, contexts: int, frames: int, size: tuple[int, int], sweep) ->
             "context": context,
             "target": target,
         }
-    scene = scenes.load_scene(name)
+    scene = scenes.load_scene(name, convention=convention)
     context, target = spread(len(scene), contexts, frames)
     images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
     return {
@@ -208,7 +222,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
             f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
         )
     for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
-        scene = read(name, args.context, config.frames, size, args.sweep)
+        scene = read(name, args.context, config.frames, size, args.sweep, args.convention)
         m = len(scene["context"])
         truth = scene["rgb"][m:]
         videos = evaluator.videos(scene)

@@ -71,17 +71,15 @@ def test_files_named_in_the_text_exist(page):
     assert not set(faults) - expected, faults
 
 
-def test_every_option_of_sample_is_explained():
-    text = (ROOT / "docs" / "sampling.md").read_text()
-    options = [action.option_strings[-1] for action in sample.parser()._actions]
+@pytest.mark.parametrize(
+    ("module", "pages"),
+    [(sample, ["sampling"]), (train, ["training", "scaling"]), (evaluate, ["metrics"])],
+    ids=["sample", "train", "evaluate"],
+)
+def test_every_option_is_explained(module, pages):
+    text = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in pages)
+    options = [a.option_strings[-1] for a in module.parser()._actions if a.option_strings]
     missing = [name for name in options if name != "--help" and f"`{name}`" not in text]
-    assert not missing, missing
-
-
-def test_every_option_of_train_is_explained():
-    text = (ROOT / "docs" / "training.md").read_text() + (ROOT / "docs" / "scaling.md").read_text()
-    options = [a.option_strings[-1] for a in train.parser()._actions if a.option_strings]
-    missing = [name for name in options if name != "--help" and f"{name}" not in text]
     assert not missing, missing
 
 

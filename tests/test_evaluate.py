@@ -47,6 +47,20 @@ def test_results_follow_the_contract(tiny, tmp_path, capsys):
     assert "plane" in capsys.readouterr().out
 
 
+def test_convention_reaches_the_reader(monkeypatch, tmp_path):
+    asked = []
+
+    def stop(name, *, convention):
+        asked.append(convention)
+        raise UserError("seen.")
+
+    monkeypatch.setattr("roge_jax.data.scene.load_scene", stop)
+    for words, expected in ((["--convention", "opencv"], "opencv"), ([], None)):
+        words = [*words, "--scenes", "kitchen", "--out", str(tmp_path / "r.json")]
+        assert entry.execute(evaluate.main, evaluate.parser(), words) == 2
+        assert asked.pop() == expected
+
+
 def test_contexts_are_spread_and_targets_are_the_rest():
     assert evaluate.spread(20, 3, 17) == (
         [3, 10, 16],
