@@ -244,10 +244,11 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     row["half"] = both(recon=(small.recon_height, small.recon_width))
     size = (engine.config.height, engine.config.width)
     worth = coverage.coverage(scene.photos.cameras, scene.path, *size)
-    order = [photo for photo, _ in coverage.greedy(worth)]
     best = coverage.covered(worth, full.photos)
     rng = np.random.default_rng(scene.seed)
-    sets = [order[:k] for k in (1, 2, 4)] + [rng.permutation(CONTEXTS)[:k].tolist() for k in (1, 2)]
+    sets = [list(kept) for kept in coverage.selections(worth) if len(kept) in (1, 2, 4)] + [
+        rng.permutation(CONTEXTS)[:k].tolist() for k in (1, 2)
+    ]
     row["photos"] = [
         [sorted(kept), 1 - coverage.covered(worth, tuple(kept)) / best, *both(photos=tuple(sorted(kept)))]
         for kept in sets

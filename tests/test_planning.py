@@ -1,6 +1,7 @@
 """The planner on the tiny model: monotone, deterministic, within budget, and at tolerance 0 the full model itself."""
 
 import dataclasses
+import itertools
 import types
 from pathlib import Path
 
@@ -237,6 +238,27 @@ def test_greedy_gains_fall_and_first_comes_who_sees_most(photos):
     gains = [gain for _, gain in coverage.greedy(worth)]
     assert gains == sorted(gains, reverse=True)
     assert sum(gains) == pytest.approx(coverage.covered(worth, (0, 1, 2, 3)))
+
+
+def test_selections_are_the_best_sets_where_greedy_ones_are_not():
+    """Three photos beside one another; the middle one sees most, the outer two together see everything."""
+    worth = np.array([[1.0, 1, 1, 0, 0, 0], [0, 0.9, 0.9, 0.9, 0.9, 0], [0, 0, 0, 1, 1, 1]])
+    assert coverage.greedy(worth)[0][0] == 1
+    assert coverage.selections(worth) == [(1,), (0, 2)]
+    rng = np.random.default_rng(0)
+    for photos in (3, 5, 7):
+        worth = rng.random((photos, 40)) ** 3
+        sets = coverage.selections(worth)
+        assert [len(s) for s in sets] == list(range(1, len(sets) + 1))
+        reached = [coverage.covered(worth, s) for s in sets]
+        assert reached == sorted(reached)
+        order = [photo for photo, _ in coverage.greedy(worth)]
+        for k, value in enumerate(reached, 1):
+            every = itertools.combinations(range(photos), k)
+            best = max(coverage.covered(worth, some) for some in every)
+            assert coverage.covered(worth, tuple(order[:k])) <= value + 1e-12 <= best + 2e-12
+            assert value > 0.97 * best
+    assert coverage.selections(np.zeros((3, 4))) == [(0,)]
 
 
 def test_photos_of_a_large_scene_are_chosen_by_what_the_path_sees(folder, photos):

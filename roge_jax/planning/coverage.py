@@ -2,8 +2,11 @@
 
 Only cameras enter, so it costs next to nothing. Depth is unknown: points stand at several multiples of the distance
 in focus, and nothing hides anything. Coverage is the mean over points of the best photo's view of each; adding a
-photo never lowers it and gains less the more photos there are, so greedy choices are within 1 - 1/e of the best set.
+photo never lowers it and gains less the more photos there are, so greedy choices are within 1 - 1/e of the best set;
+exchanging photos one for one (`selections`) closes most of what is left.
 """
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -74,12 +77,49 @@ def see_path(scene: Scene, path: Cameras, m: int, height: int, width: int) -> li
         for K, size in zip(scene.cameras.K, scene.sizes, strict=True)
     ]
     worth = coverage(Cameras(np.stack(K), scene.cameras.c2w), path, height, width)
-    return [photo for photo, _ in greedy(worth)][:m]
+    chosen = selections(worth, m)[-1]
+    return [chosen[i] for i, _ in greedy(worth[list(chosen)])]
 
 
 def covered(worth: np.ndarray, chosen: tuple[int, ...]) -> float:
     """Coverage by the `chosen` rows of `coverage`, 0 to 1."""
     return float(worth[list(chosen)].max(0).mean()) if chosen else 0.0
+
+
+def selections(worth: np.ndarray, most: int | None = None) -> list[tuple[int, ...]]:
+    """Sets of 1, 2, ... photos, each of them sorted, until another photo adds nothing or there are `most`.
+
+    Each set is the one before and the photo that adds most; then a photo is exchanged for another as long as that
+    raises the coverage. (Greedy sets alone start in the middle of the path and never leave it: of two photos they
+    keep one that a better pair would not have.) Coverage never falls along the list. Deterministic.
+    """
+    sets: list[tuple[int, ...]] = []
+    kept: tuple[int, ...] = ()
+    while len(kept) < min(len(worth), len(worth) if most is None else most):
+        grown = _best(worth, [kept], covered(worth, kept) + NOTHING)
+        if not grown and kept:
+            break
+        kept = grown or (0,)
+        while True:
+            others = [tuple(i for i in kept if i != out) for out in kept]
+            exchanged = _best(worth, others, covered(worth, kept) + NOTHING)
+            if not exchanged:
+                break
+            kept = exchanged
+        sets.append(kept)
+    return sets
+
+
+def _best(worth: np.ndarray, sets: Sequence[tuple[int, ...]], above: float) -> tuple[int, ...]:
+    """Of all sets with one photo more, the one with the largest coverage, if that is `above`; else ()."""
+    found: tuple[int, ...] = ()
+    for some in sets:
+        for photo in range(len(worth)):
+            trial = tuple(sorted((*some, photo)))
+            value = covered(worth, trial) if photo not in some else -1.0
+            if value > above:
+                found, above = trial, value
+    return found
 
 
 def greedy(worth: np.ndarray) -> list[tuple[int, float]]:

@@ -127,13 +127,11 @@ def seen(photos: Photos, path: Cameras, config: RoGeConfig) -> float:
 
 
 def _photo_sets(worth: np.ndarray) -> list[tuple[tuple[int, ...], float | None]]:
-    """(photos, coverage lost) of every greedy prefix; None: all photos, nothing changes."""
+    """(photos, coverage lost) of the best sets of each size; None: all photos, nothing changes."""
     everything = tuple(range(len(worth)))
-    order = [photo for photo, _ in coverage.greedy(worth)]
     best = coverage.covered(worth, everything)
     sets: list[tuple[tuple[int, ...], float | None]] = [(everything, None)]
-    for k in range(1, len(order) + 1):
-        kept = tuple(sorted(order[:k]))
+    for kept in coverage.selections(worth):
         if kept != everything:
             sets.append((kept, 1.0 - coverage.covered(worth, kept) / max(best, 1e-12)))
     return sets

@@ -28,7 +28,7 @@ from .options import Option, choose, full_choices, list_options, next_best, trai
 from .table import Table, load
 
 TOLERANCE = 0.02
-PROBE = 0.04
+PROBE = 0.01
 
 
 class Purchase(NamedTuple):
