@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from roge_jax import evaluate, model, preview, sampling
+from roge_jax import evaluate, model, preview, programs, sampling
 from roge_jax.data import procedural
 from roge_jax.data.raycast import OBJECTS, ROOM, render_views
 from roge_jax.geometry.cameras import Cameras, normalise
@@ -126,8 +126,8 @@ class Engine:
         self.params, self.config = params, config
         self.settings = sampling.Settings().of(config)
         self.programs: dict = {}
-        self.velocity = jax.jit(functools.partial(sampling.velocity, config=config, slots="noised"))
-        self.decode = jax.jit(functools.partial(sampling.decode, config=config, contexts=0))
+        self.velocity = jax.jit(functools.partial(programs.velocity, config=config, slots="noised"))
+        self.decode = jax.jit(functools.partial(programs.decode, config=config, contexts=0))
         self.encode = jax.jit(functools.partial(model.encode_contexts, config=config))
 
     def program(self, f, config):

@@ -44,7 +44,7 @@ from robustness_report import (
     write_limits,
 )
 
-from roge_jax import checkpoint, entry, limits, sampling
+from roge_jax import checkpoint, entry, limits, programs, sampling
 from roge_jax.data import perturb
 from roge_jax.data.procedural import (
     HELDOUT_SEED,
@@ -181,7 +181,7 @@ class Runner:
 
     def __init__(self, name: str):
         self.params, self.config = checkpoint.load_model(name)
-        self.programs: dict[int, sampling.Programs] = {}
+        self.programs: dict[int, programs.Programs] = {}
         self.settings = sampling.Settings().of(self.config)
 
     def videos(self, case: Case) -> dict[str, np.ndarray]:

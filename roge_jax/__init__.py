@@ -28,6 +28,7 @@ _MODULES = (
     "model",
     "config",
     "checkpoint",
+    "programs",
     "sampling",
     "fusion",
     "preview",

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from roge_jax import cost, model, sampling
+from roge_jax import cost, model, programs
 from roge_jax.config import preset
 from roge_jax.core.attention import SCORES_BYTES
 from roge_jax.core.params import abstract, count
@@ -240,12 +240,12 @@ class TestEstimate:
         prepared = jax.eval_shape(lambda p, views: model.prepare(p, views, config=config), p, views)
 
         def step(p, prepared, x):
-            return sampling.velocity(
+            return programs.velocity(
                 p, prepared, x, x, jnp.float32(0.5), config=config, slots="noised"
             )
 
         def decode(p, x):
-            return sampling.decode(p, x, None, config=config, contexts=1)
+            return programs.decode(p, x, None, config=config, contexts=1)
 
         for name, function, arguments in (
             ("decode", decode, (p, state)),

@@ -35,8 +35,9 @@ ALLOWED = {
     "limits": _BASE,
     "training": _PARTS | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost"},
     "windows": _PARTS | {"model"},
-    "sampling": _PARTS | {"model", "data", "cost", "windows", "limits"},
-    "planning": _PARTS | {"model", "data", "cost", "windows", "sampling"},
+    "programs": _PARTS | {"model"},
+    "sampling": _PARTS | {"model", "data", "programs", "windows", "limits"},
+    "planning": _PARTS | {"model", "data", "cost", "windows", "programs", "sampling"},
 }
 # Programs and their helpers may import anything but other programs.
 PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check"}

@@ -9,7 +9,7 @@ import numpy as np
 from test_sampling_mesh import cameras
 from test_sharding import drawn, small
 
-from roge_jax import config, model, sampling
+from roge_jax import config, model, programs, sampling
 from roge_jax.core import program
 from roge_jax.core.attention import attention, scores_limit
 from roge_jax.core.params import abstract
@@ -107,11 +107,11 @@ def test_nine_photos_81_frames_480x832_has_its_shapes():
     assert ready.condition.tokens.shape == (46_800, cfg.dit.width)
     x = jax.ShapeDtypeStruct((9 + 21, 60, 104, 16), jnp.float32)
     out = jax.eval_shape(
-        lambda p, ready, x: sampling.velocity(p, ready, x, x, 0.5, config=cfg, slots="noised"),
+        lambda p, ready, x: programs.velocity(p, ready, x, x, 0.5, config=cfg, slots="noised"),
         params, ready, x,
     )  # fmt: skip
     assert out.shape == x.shape
     video = jax.eval_shape(
-        lambda p, x: sampling.decode(p, x, None, config=cfg, contexts=m), params, x
+        lambda p, x: programs.decode(p, x, None, config=cfg, contexts=m), params, x
     )
     assert video.shape == (81, 480, 832, 3)

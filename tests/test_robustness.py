@@ -14,7 +14,7 @@ import pytest
 from camera_cases import looking_at_origin
 from scene_files import nerfstudio, truth
 
-from roge_jax import checkpoint, entry, limits, model, sample, sampling
+from roge_jax import checkpoint, entry, limits, model, programs, sample
 from roge_jax.config import preset
 from roge_jax.data import perturb
 from roge_jax.errors import LimitWarning
@@ -195,7 +195,7 @@ def test_shipped_limits_say_where_they_come_from():
 def without_network(params, views, config, slots):
     """Programs that give grey frames: nothing is compiled."""
     video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
-    return sampling.Programs(
+    return programs.Programs(
         prepare=lambda params, views: SimpleNamespace(features=None, detail=None),
         velocity=lambda params, prepared, noise, x, sigma: jnp.zeros_like(x),
         decode=lambda params, x0, detail: video,
@@ -207,7 +207,7 @@ def test_the_program_warns_once_and_records_it(tmp_path, monkeypatch, capsys):
     config = preset("tiny")
     checkpoint.save_model(tmp_path / "model", model.init(jax.random.key(0), config), config)
     nerfstudio(tmp_path / "scene", truth(3))
-    monkeypatch.setattr(sampling, "programs", without_network)
+    monkeypatch.setattr(programs, "for_window", without_network)
 
     def run(limit):
         rows = {"extrapolation": {"limit": limit, "broke": True}}

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from roge_jax import config as presets
-from roge_jax import cost, model, sampling
+from roge_jax import cost, model, programs
 from roge_jax.config import RoGeConfig
 from roge_jax.core.params import Tree, flatten, unflatten
 from roge_jax.fusion import Condition
@@ -184,7 +184,7 @@ def job(row: Row, dtype: Any) -> Job:
         flops = n * cost.renderer_view(cfg.renderer, *size, m * grid[0] * grid[1])
         return compiled(pictures, pick("renderer"), z, targets, views, flops=flops, frames=n)
     if row.group == "vae":
-        run = functools.partial(sampling.decode, config=cfg, contexts=m)
+        run = functools.partial(programs.decode, config=cfg, contexts=m)
         flops = cost.vae_decode(cfg.vae, n, cfg.height, cfg.width)
         return compiled(run, pick("vae"), noise, None, flops=flops)
     if row.group == "sample":
@@ -196,7 +196,7 @@ def job(row: Row, dtype: Any) -> Job:
 def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise: jax.Array) -> Job:
     """As `python -m roge_jax.sample` does it: reconstruction, rays, encoding, 50 Euler steps, decoding, preview."""
     start = time.perf_counter()
-    run = sampling.programs(params, views, cfg, "noised")
+    run = programs.for_window(params, views, cfg, "noised")
     seconds = time.perf_counter() - start
     sigmas = flow.schedule("shift", 50, shift=cfg.flow.shift)
 

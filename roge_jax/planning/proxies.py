@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import cost, model, sampling
+from .. import cost, model, programs, sampling
 from ..config import RoGeConfig
 from ..core.params import Tree
 from ..geometry.cameras import Cameras, normalise
@@ -123,7 +123,7 @@ def _predict(params, batch, *, config: RoGeConfig):
 
     def one(views):
         tokens = model.reconstruct(params, views, config=config)
-        picture = sampling.rgb_head(params, views, config=config, scene_tokens=tokens)
+        picture = programs.rgb_head(params, views, config=config, scene_tokens=tokens)
         cell = jnp.square(tokens).mean() - jnp.square(merge_scene(tokens, None, grid, 4)[0]).mean()
         return picture[0], cell / jnp.square(tokens).mean()
 
