@@ -246,7 +246,8 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     worth = coverage.coverage(scene.photos.cameras, scene.path, *size)
     best = coverage.covered(worth, full.photos)
     rng = np.random.default_rng(scene.seed)
-    sets = [list(kept) for kept in coverage.selections(worth) if len(kept) in (1, 2, 4)] + [
+    chosen = coverage.selections(worth)  # of bursts, three or four photos see all there is
+    sets = [list(chosen[min(k, len(chosen)) - 1]) for k in (1, 2, 4)] + [
         rng.permutation(CONTEXTS)[:k].tolist() for k in (1, 2)
     ]
     row["photos"] = [
