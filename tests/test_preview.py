@@ -10,7 +10,7 @@ import pytest
 from test_model import CONFIG, PREVIEW, SLOTS, M, N, made_condition, sample, whole
 
 from roge_jax import fusion, model, preview
-from roge_jax.video import flow
+from roge_jax.video import flow, solvers
 
 
 def shrunk(config, factor):
@@ -64,25 +64,31 @@ def silent(p):
 
 def test_a_transformer_that_says_nothing_generates_the_preview_and_its_error():
     """The exact flow of a normal distribution: noise arrives at preview + spread * noise."""
-    known, features, views = made_condition(ABOUT)
-    cond = model.condition(whole(), known, features, views, config=ABOUT)
-    ready = model.Prepared(known, features, cond, None, None)
-    noise = model.draw_noise(jax.random.key(5), M, config=ABOUT)
-    run = functools.partial(model.generate, silent(whole()), ready, noise, config=ABOUT)
-    found, _ = run(solver="rk4", sigmas=flow.schedule("graded", 40))
-    preview = cond.appearance[M:, ..., 4:]
-    np.testing.assert_allclose(
-        found, preview + np.asarray(SPREAD)[None, None, None] * noise[M:], atol=2e-4
+    rng = np.random.default_rng(5)
+    known, guess, noise = (
+        jnp.asarray(rng.standard_normal((n, *CONFIG.latent_size, 16)), jnp.float32)
+        for n in (M, SLOTS - M, SLOTS)
     )
-    coarse, _ = run(solver="euler", sigmas=flow.schedule("graded", 4))
-    assert np.abs(coarse - found).max() > 0.05, "steps matter"
+    cond = fusion.Condition(
+        fusion.appearance(known, SLOTS, guess), jnp.zeros(()), jnp.asarray(SPREAD)
+    )
+
+    def nothing(x, sigma):
+        return preview.velocity(jnp.zeros_like(x), x, sigma, cond, M)
+
+    found, _ = solvers.solve("rk4", nothing, noise, flow.schedule("graded", 40))
+    want = guess + np.asarray(SPREAD)[None, None, None] * noise[M:]
+    np.testing.assert_allclose(found[M:], want, atol=2e-4)
+    coarse, _ = solvers.solve("euler", nothing, noise, flow.schedule("graded", 4))
+    assert np.abs(coarse[M:] - want).max() > 0.05, "steps matter"
 
 
 def test_about_a_preview_the_transformer_corrects_in_units_of_its_error():
+    velocity = jax.jit(model.velocity, static_argnames=("config", "contexts"))
     known, features, views = made_condition(ABOUT)
     x = model.draw_noise(jax.random.key(6), M, config=ABOUT)
     said, quiet, plain = (
-        model.velocity(
+        velocity(
             p,
             x,
             jnp.float32(1.0),
@@ -98,8 +104,8 @@ def test_about_a_preview_the_transformer_corrects_in_units_of_its_error():
     np.testing.assert_array_equal(said[:M], plain[:M])  # contexts: the velocity itself
     alone = fusion.unconditioned(known, SLOTS, ABOUT)  # and wherever no preview is shown
     np.testing.assert_array_equal(
-        model.velocity(whole(), x, jnp.float32(0.5), alone, config=ABOUT, contexts=M),
-        model.velocity(whole(), x, jnp.float32(0.5), alone, config=CONFIG, contexts=M),
+        velocity(whole(), x, jnp.float32(0.5), alone, config=ABOUT, contexts=M),
+        velocity(whole(), x, jnp.float32(0.5), alone, config=CONFIG, contexts=M),
     )
 
 
@@ -126,8 +132,9 @@ def test_latents_left_as_they_are_come_out_as_the_reconstructions_own_picture(sh
 
 def test_what_is_prepared_holds_the_detail_where_there_is_a_preview():
     views = {k: jnp.asarray(v) for k, v in sample(4).items() if k != "target_rgb"}
-    ready = model.prepare(whole(), views, config=ABOUT)
+    ready = jax.jit(functools.partial(model.prepare, config=ABOUT))(whole(), views)
     want = preview.lost_detail(whole(), ready.features, ready.condition, config=ABOUT)
     np.testing.assert_allclose(ready.detail, want, atol=1e-5)
     assert ready.detail.shape == (N, CONFIG.height, CONFIG.width, 3)
-    assert model.prepare(whole(), views, config=CONFIG).detail is None
+    plain = functools.partial(model.prepare, config=CONFIG)
+    assert jax.eval_shape(plain, whole(), views).detail is None

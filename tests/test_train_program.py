@@ -17,7 +17,7 @@ from roge_jax.core.params import flatten
 from roge_jax.data.source import open_source
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
-from roge_jax.training import stages
+from roge_jax.training import loop, stages
 
 
 def run(*arguments) -> None:
@@ -147,7 +147,7 @@ def test_the_error_of_the_preview_is_measured_and_the_head_starts_again(common):
     )
     batch = draw_batch(source, 4, 0, 1, views, scale_rule=cfg.scale_rule)
     views = {name: jnp.asarray(x[0]) for name, x in batch.items()}
-    prepared = model.prepare(moved, views, config=found)
+    prepared = jax.jit(functools.partial(model.prepare, config=found))(moved, views)
     noise = model.draw_noise(jax.random.key(1), 3, config=found)
     velocity = model.velocity(
         moved, noise, jnp.float32(1.0), prepared.condition, config=found, contexts=3
@@ -163,17 +163,28 @@ def test_a_generator_is_trained_about_the_preview_once(common, tmp_path, monkeyp
     cfg = config.preset("tiny")
     cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview=True))
     save_model(tmp_path / "start", model.init(jax.random.key(0), cfg), cfg)
-    calls, measure = [], stages.measure_preview
-    monkeypatch.setattr(
-        stages, "measure_preview", lambda *a: calls.append(1) or measure(*a, clips=1)
-    )
+    seen = []
+
+    def measure(params, source, cfg, seed):
+        std = (0.5,) * cfg.vae.latent
+        return params, dataclasses.replace(
+            cfg, fusion=dataclasses.replace(cfg.fusion, preview_std=std)
+        )
+
+    def train_nothing(objective, trainable, *rest, **options):
+        seen.append(objective.keywords["config"].fusion.preview_std)
+        (options["out"] / "log.jsonl").touch()
+        return {"params": trainable, "step": 0, "skipped": 0}
+
+    monkeypatch.setattr(stages, "measure_preview", measure)
+    monkeypatch.setattr(loop, "train", train_nothing)
     start = tmp_path / "start"
     for k in (1, 2):
-        words = ["--steps", 1, "--batch", 1, "--out", tmp_path / f"{k}"]
-        run(*common, "--stage", "generator", "--init", start, *words)
+        run(*common, "--stage", "generator", "--init", start, "--out", tmp_path / f"{k}")
         start = tmp_path / f"{k}" / "generator" / "model"
-        assert load_model(start)[1].fusion.preview_std is not None
-    assert len(calls) == 1
+        assert load_model(start)[1].fusion.preview_std == (0.5,) * 16
+        monkeypatch.setattr(stages, "measure_preview", None)  # the second run has no need of it
+    assert seen == [(0.5,) * 16] * 2  # and the objective knows
 
 
 def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):
