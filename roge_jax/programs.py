@@ -103,7 +103,7 @@ def rgb_head(
 def for_preview(
     params: Tree, views: model.Views, config: RoGeConfig, slots: flow.ContextSlots
 ) -> PreviewProgram:
-    """`programs` for a window that is not generated."""
+    """`for_window`, where the window is not generated."""
     piece = jax.jit(functools.partial(rgb_head, config=config))
     return PreviewProgram(piece.lower(params, views).compile())
 
