@@ -5,10 +5,11 @@
 
 CPU, about an hour on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
 settings or the shipped weights that they measure have changed; several processes may share the work, each on its core
-with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Four groups:
+with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Five groups:
 
   reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, 3 photos), every variant for the FLOPs of 80
                   steps of the base; PSNR of the RGB head on 32 held-out scenes, paired with the base
+  look-up         the shipped reconstruction: PSNR of the RGB head, of what the rays find in the photos, and of both
   conditions      the shipped generator: held-out flow error by noise level with a condition zeroed or taken from
                   another scene, the same noise for all
   finetune        the shipped generator trained on for equal steps while a condition is absent: what it can replace
@@ -19,6 +20,7 @@ The published system reports no such ablation. Our numbers and what they are wor
 """
 
 import argparse
+import dataclasses
 import hashlib
 import json
 import subprocess
@@ -58,16 +60,22 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
     """Everything to measure, in the order of the run."""
     source = read_pool(args.data) if args.data else ProceduralSource(64, 112, 24)
     mini, (params, config) = preset("mini"), checkpoint.load_model("mini")
+    plain = dataclasses.replace(mini, renderer=dataclasses.replace(mini.renderer, lookup=0))
     weights = {"weights": fingerprint(params), "clips": args.clips}
     found = {
         name: Job(
             "reconstruction",
             {"steps": args.steps},
-            lambda v=variant: reconstruction.train(v, mini, source, args.steps),
+            lambda v=variant: reconstruction.train(v, plain, source, args.steps),
         )
         for name, variant in reconstruction.VARIANTS.items()
     }
     return found | {
+        "look-up": Job(
+            "look-up",
+            {"weights": weights["weights"]},
+            lambda: reconstruction.look_up(params, config),
+        ),
         "conditions": Job(
             "conditions", weights, lambda: generator.conditions(params, config, args.clips)
         ),
@@ -107,7 +115,7 @@ def measured(job: Job) -> dict:
 def stored(path: Path) -> dict[str, dict]:
     """The finished rows, in the order in which they are shown."""
     rows = json.loads(path.read_text())["rows"] if path.exists() else {}
-    order = [*reconstruction.VARIANTS, "conditions", "finetune", "lora"]
+    order = [*reconstruction.VARIANTS, "look-up", "conditions", "finetune", "lora"]
     return dict(sorted(rows.items(), key=lambda item: order.index(item[0])))
 
 

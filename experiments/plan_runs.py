@@ -160,10 +160,10 @@ class Engine:
         """The frames [n, h, w, 3] under `choices`."""
         if choices in scene.kept:
             return scene.kept[choices]
-        m, config = len(choices.photos), self.config
+        config = self.config
         views, features = self.features(scene, choices)
         if not choices.generate[0]:
-            head = self.program(model.decode_rgb, config)(self.params, features[m:])
+            head = self.program(model.show, config)(self.params, features, views)
             frames = np.asarray(model.resized(head, config.height, config.width))
         else:
             frames = np.asarray(
@@ -178,9 +178,11 @@ class Engine:
         if "latents" not in scene.kept:
             scene.kept["latents"] = self.encode(self.params, scene.photos.images)
         known = scene.kept["latents"][np.array(choices.photos)]
-        cond = self.program(model.condition, self.config)(self.params, known, features, views)
-        lost = self.program(preview.lost_detail, self.config)(self.params, features, cond)
-        prepared = model.Prepared(known, jnp.zeros(()), cond, None, lost)
+        shown = self.program(model.show, self.config)(self.params, features, views)
+        condition = self.program(model.condition, self.config)
+        cond = condition(self.params, known, features, views, shown=shown)
+        lost = self.program(preview.lost_detail, self.config)(self.params, shown, cond)
+        prepared = model.Prepared(known, features, shown, cond, None, lost)
         noise = sampling.draw_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
         settings = dataclasses.replace(
             self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule

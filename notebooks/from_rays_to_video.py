@@ -65,7 +65,7 @@ print(rays.shape, "unit directions:", bool(np.allclose(np.linalg.norm(rays[..., 
 # %%
 tokens = jax.jit(functools.partial(rj.model.reconstruct, config=config))(params, views)
 features = jax.jit(functools.partial(rj.model.query_rays, config=config))(params, tokens, views)
-preview = jax.jit(functools.partial(rj.model.decode_rgb, config=config))(params, features)
+preview = jax.jit(functools.partial(rj.model.decode_rgb, config=config))(params, features, views)
 print("scene tokens", tokens.shape, "ray features", features.shape)
 
 # %% [markdown]

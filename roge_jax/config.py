@@ -47,6 +47,8 @@ class RendererConfig:
     # Of bidirectional attention: scene tokens refined for every queried view, or once by the contexts' rays.
     refinement: Literal["per_view", "shared"] = "per_view"
     relative_cameras: bool = False  # projective; "full" attention has no such form
+    # Cuts along every ray at which it looks into the photos themselves; 0: it sees scene tokens alone.
+    lookup: int = 0
     chunk: int = 8  # views processed at a time
     merge: Literal[1, 2, 4] = 1  # scene tokens of a photo averaged into one: 2 in a row, 2 x 2
 
@@ -119,9 +121,7 @@ class LoraConfig:
     dit_rank: int = 32
     dit_match: str = r"blocks/.*(self_attn|cross_attn)/(q|k|v|o)$|blocks/.*ffn/(fc1|fc2)$"
     recon_rank: int = 8
-    recon_match: str = (
-        r"^(?!encoder/patch_encoder/patch_embed$)"  # every linear and the ray convolution
-    )
+    recon_match: str = r"^(?!encoder/patch_encoder/patch_embed$|renderer/lookup/)"  # every linear and the ray convolution
 
 
 @dataclass(frozen=True)
@@ -157,6 +157,11 @@ class RoGeConfig:
             raise UserError(
                 f"Reconstruction size {self.recon_height}x{self.recon_width} does not fit: both must be "
                 f"multiples of {p}; try {_nearest(self.recon_height, p)}x{_nearest(self.recon_width, p)}."
+            )
+        if self.renderer.lookup == 1 or (self.renderer.lookup and p % 4):
+            raise UserError(
+                f"renderer.lookup {self.renderer.lookup} with patches of {p} pixels does not fit: give 0 or at least 2 "
+                "cuts, and a patch that is a multiple of 4."
             )
         if self.frames < 1 or self.frames % 4 != 1:
             k = max(self.frames - 1, 0) // 4
@@ -219,7 +224,13 @@ def _mini() -> RoGeConfig:
             relative_cameras=True,
         ),
         renderer=RendererConfig(
-            width=192, heads=4, depth=6, attention="cross", relative_cameras=True, chunk=32
+            width=192,
+            heads=4,
+            depth=6,
+            attention="cross",
+            relative_cameras=True,
+            lookup=48,
+            chunk=32,
         ),
         vae=VAEConfig(base=16),
         dit=DiTConfig(

@@ -16,6 +16,7 @@ from . import model
 from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
 from .core.attention import SCORES_BYTES
 from .core.params import flatten
+from .recon.lookup import ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
 from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
 from .video.dit import FLOAT32_LEAVES
@@ -81,6 +82,25 @@ def renderer(
     return total + m * per_view if shared else total
 
 
+def lookup(cfg: RendererConfig, height: int, width: int, m: int, views: int) -> float:
+    """Matrix products and convolutions of `recon.lookup`; fetching from the photos is not counted."""
+    if not cfg.lookup:
+        return 0.0
+    pixels, c, fine = height * width, WIDTH, FINE
+    cells = pixels // CELL**2
+    rays = pixels // cfg.patch**2
+    coarse = (MATCHED + 6 + c) * c + BLOCKS * (9 + ALONG) * c * c + c
+    per_view = (
+        rays * cfg.width * (cfg.patch // CELL) ** 2 * (cfg.lookup + c)
+        + cells * (cfg.lookup * coarse + 2 * c * 9 * CELL**2)
+        + pixels * 9 * (8 * fine * c + c * c + c * fine)
+        + pixels * 9 * (14 * c + c * c + 4 * c)
+        + m * pixels * 9 * (11 * c + c)
+    )
+    per_photo = 9 * (pixels // 4 * 3 * 16 + cells * (16 * 16 + 16 * MATCHED))
+    return 2.0 * (views * per_view + m * per_photo)
+
+
 def scene_tokens_read(config: RoGeConfig, m: int) -> int:
     """Scene tokens of m photos that the rays attend to, after `RendererConfig.merge`."""
     grid = encoder_grid(config.encoder, config.recon_height, config.recon_width)
@@ -89,10 +109,11 @@ def scene_tokens_read(config: RoGeConfig, m: int) -> int:
 
 
 def preview(config: RoGeConfig, m: int) -> float:
-    """A window that is not generated: photos to scene tokens, the targets' rays, the RGB head."""
+    """A window that is not generated: photos to scene tokens, the targets' rays, the RGB head, the photo look-up."""
     size, tokens = (config.recon_height, config.recon_width), scene_tokens_read(config, m)
     views = config.frames + (m if config.renderer.refinement == "shared" else 0)
     rays = renderer(config.renderer, *size, tokens, m, views)
+    rays += lookup(config.renderer, *size, m, config.frames)
     return encoder(config.encoder, *size, m, config.renderer.width) + rays
 
 
@@ -288,6 +309,11 @@ def estimate(
         "encode photos (VAE)": m * vae_encode(config.vae, 1, config.height, config.width),
         "reconstruct": encoder(config.encoder, *size, m, config.renderer.width),
         "query rays": renderer(config.renderer, *size, scene_tokens, m, m + n),
+        **(
+            {"look into photos": lookup(config.renderer, *size, m, n)}
+            if config.renderer.lookup
+            else {}
+        ),
         "condition": fusion(config, m + n, slots) + text(config.dit),
         **({"preview (VAE, both ways)": both_ways} if config.fusion.preview else {}),
         "velocity": velocity(config.dit, tokens),
@@ -304,12 +330,16 @@ def estimate(
     features = 4.0 * (m + n) * rays * r.width
     chunked = decoder_tensor_bytes(config) > SINGLE_PASS_BYTES
     maps = MAPS * decoder_tensor_bytes(config, 4 if chunked else n)
+    # Four neighbours of every sample, their mixture and its square: of two levels, the larger one.
+    cells = size[0] * size[1] // CELL**2
+    fetched = 24.0 * n * m * max(r.lookup * cells * (MATCHED + 3), 3 * FINE * size[0] * size[1])
     working = {
         "encode photos (VAE)": MAPS * decoder_tensor_bytes(config, m),
         "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
         "query rays": features
         + scores(chunk * ray_tokens, scene_tokens, r.heads)
         + 4.0 * chunk * (ray_tokens + refined * scene_tokens) * 10 * r.width,
+        **({"look into photos": features + fetched} if r.lookup else {}),
         "condition": 4.0 * tokens * d.patch**2 * (6 * 4 * 64 + 4 * config.fusion.geometry_channels),
         **({"preview (VAE, both ways)": features + maps} if config.fusion.preview else {}),
         "velocity": features

@@ -160,7 +160,6 @@ class Evaluator:
         self.prepare = jax.jit(functools.partial(model.prepare, config=config))
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
-        self.rgb = jax.jit(functools.partial(model.decode_rgb, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
         self.noise = functools.partial(sampling.draw_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
@@ -185,7 +184,7 @@ class Evaluator:
         latents, info = self.generate(self.params, prepared, self.noise(m))
         self.raise_if_failed(info)
         h, w = truth.shape[1:3]
-        head = np.asarray(self.rgb(self.params, prepared.features[m:]))
+        head = np.asarray(prepared.shown)
         return {
             "generated": np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n],
             "rgb_head": np.stack([resize(image, h, w) for image in head[:n]]),

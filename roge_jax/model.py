@@ -29,6 +29,9 @@ from .core.sharding import over_scenes
 from .fusion import Condition
 from .geometry.rays import plucker
 from .recon import ray_scene, vggt
+from .recon.picture import decode_rgb as decode_rgb
+from .recon.picture import only_targets as only_targets
+from .recon.picture import recon_cameras, recon_photos, show
 from .recon.relative import Relative, relative_cameras
 from .video import dit, flow, solvers, vae, vae_training
 
@@ -73,20 +76,11 @@ def adapter_specs(config: RoGeConfig) -> Tree:
 # Reconstruction (Sec. 3.1).
 
 
-def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Array]:
-    """K of all views in pixels of the reconstruction images (a plain resize of the generation crop), and c2w."""
-    scale = jnp.asarray(
-        [config.recon_width / config.width, config.recon_height / config.height, 1.0]
-    )
-    return views["K"] * scale[None, :, None], views["c2w"]
-
-
 @jax.named_scope("reconstruct")
 def reconstruct(params: Tree, views: Views, *, config: RoGeConfig) -> jax.Array:
     """The implicit scene: tokens Z [m, l, d] of the context photos."""
     size = (config.recon_height, config.recon_width)
-    images = views.get("context_recon")
-    images = resized(views["context_rgb"], *size) if images is None else images
+    images = recon_photos(views, config)
     m = images.shape[0]
     K, c2w = recon_cameras(views, config)
     rays = plucker(K[:m], c2w[:m], *size)
@@ -142,11 +136,6 @@ def query_rays(
     )
 
 
-def decode_rgb(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array:
-    """The reconstruction's own picture [v, recon_height, recon_width, 3] of ray features."""
-    return ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=config.renderer)
-
-
 # Generation (Sec. 3.2).
 
 
@@ -179,9 +168,16 @@ def condition(
     views: Views,
     *,
     config: RoGeConfig,
+    shown: jax.Array | None = None,
 ) -> Condition:
-    """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views, contexts first."""
-    guess = preview.latents(params, features[context_latents.shape[0] :], config=config)
+    """C = {Y, P, G} from context latents [m, lh, lw, 16] and ray features of all views, contexts first.
+
+    `shown`: the reconstruction's picture of the targets (`show`), which a model with a preview encodes; made here if it
+    is not given.
+    """
+    if shown is None and config.fusion.preview:
+        shown = show(params, features, views, config=config)
+    guess = None if shown is None else preview.latents(params, shown, config=config)
     rays = plucker(views["K"], views["c2w"], config.height, config.width)
     features = fusion.standardised(features, config)
     return fusion.condition(
@@ -235,10 +231,8 @@ def text_cache(params: Tree, *, config: RoGeConfig) -> Tree | None:
 # Training (Sec. 3.3).
 
 
-def photometric(
-    params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig
-) -> jax.Array:
-    """Mean squared error of the RGB head over all M + N views."""
+def photometric(rgb: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
+    """Mean squared error of the reconstruction's picture [m + n, recon_height, recon_width, 3] of all views."""
     size = (config.recon_height, config.recon_width)
     truth = [
         resized(views[f"{kind}_rgb"], *size)
@@ -246,7 +240,6 @@ def photometric(
         else views[f"{kind}_recon"]
         for kind in ("context", "target")
     ]
-    rgb = decode_rgb(params, features, config=config)
     return jnp.square(rgb - jnp.concatenate(truth)).mean()
 
 
@@ -312,12 +305,13 @@ def scene_loss(
             encode_targets(params, views["target_rgb"], config=config),
         ]
     )
-    cond = condition(params, x0[:m], features, views, config=config)
+    rgb = decode_rgb(params, features, views, config=config)
+    cond = condition(params, x0[:m], features, views, config=config, shown=rgb[m:])
     return {
         "flow": mean_flow_matching(
             params, x0, cond, key, draws=draws, config=config, contexts=m, remat=remat
         ),
-        "photometric": photometric(params, features, views, config=config),
+        "photometric": photometric(rgb, views, config=config),
     }
 
 
@@ -355,6 +349,9 @@ class Prepared(NamedTuple):
 
     context_latents: jax.Array  # [m, lh, lw, 16]
     features: jax.Array  # [m + n, gh, gw, d]
+    shown: (
+        jax.Array
+    )  # [n, recon_height, recon_width, 3], the reconstruction's own picture of the targets
     condition: Condition
     text: Tree | None
     detail: jax.Array | None  # [n, h, w, 3], see `preview.lost_detail`
@@ -368,9 +365,10 @@ def prepare(
         scene_tokens = reconstruct(params, views, config=config)
     features = query_rays(params, scene_tokens, views, config=config)
     latents = encode_contexts(params, views["context_rgb"], config=config)
-    cond = condition(params, latents, features, views, config=config)
-    detail = preview.lost_detail(params, features, cond, config=config)
-    return Prepared(latents, features, cond, text_cache(params, config=config), detail)
+    shown = show(params, features, views, config=config)
+    cond = condition(params, latents, features, views, config=config, shown=shown)
+    detail = preview.lost_detail(params, shown, cond, config=config)
+    return Prepared(latents, features, shown, cond, text_cache(params, config=config), detail)
 
 
 def draw_noise(key: jax.Array, contexts: int, *, config: RoGeConfig) -> jax.Array:

@@ -2,7 +2,7 @@
 
 Not in the paper (`FusionConfig.preview`, on in `mini`). A large pretrained transformer can learn to turn ray features
 into latents; a small one spends its training on becoming a second encoder, and its VAE blurs all that passes. So the
-frames of the RGB head, encoded, stand where the condition has zeros; once their error was measured the transformer
+reconstruction's own frames, encoded, stand where the condition has zeros; once their error was measured the transformer
 says only how the velocity differs from what they imply; and generated frames get back what the VAE loses of them.
 """
 
@@ -13,24 +13,18 @@ from .config import RoGeConfig
 from .core.layers import resized
 from .core.params import Tree
 from .fusion import MASK_CHANNELS, Condition
-from .recon import ray_scene
 from .video import flow, vae
 
 
-def frames(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array:
-    """The RGB head's picture of ray features [n, gh, gw, d] at the video's size [n, h, w, 3]."""
-    rgb = ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=config.renderer)
-    return resized(rgb, config.height, config.width)
+def latents(params: Tree, shown: jax.Array, *, config: RoGeConfig) -> jax.Array | None:
+    """The reconstruction's picture of the targets `shown` [n, h, w, 3] (`model.show`), encoded
+    [1 + (n - 1) / 4, lh, lw, 16]; None for a model without preview.
 
-
-def latents(params: Tree, features: jax.Array, *, config: RoGeConfig) -> jax.Array | None:
-    """`frames` of the targets' ray features, encoded [1 + (n - 1) / 4, lh, lw, 16]; None for a model without preview.
-
-    No gradient passes: the features learn through G and the photometric term.
+    No gradient passes: the reconstruction learns through G and the photometric term.
     """
     if not config.fusion.preview:
         return None
-    video = 2.0 * frames(params, jax.lax.stop_gradient(features), config=config) - 1.0
+    video = 2.0 * resized(jax.lax.stop_gradient(shown), config.height, config.width) - 1.0
     return jax.lax.stop_gradient(vae.encode_any(params["vae"], video, cfg=config.vae))
 
 
@@ -50,15 +44,15 @@ def velocity(
 
 
 def lost_detail(
-    params: Tree, features: jax.Array, cond: Condition, *, config: RoGeConfig
+    params: Tree, shown: jax.Array, cond: Condition, *, config: RoGeConfig
 ) -> jax.Array | None:
-    """What the VAE loses of the preview [n, h, w, 3]: `frames` less `latents` decoded; None without a preview.
+    """What the VAE loses of the preview [n, h, w, 3]: `shown` less `latents` decoded; None without a preview.
 
-    `features` and `cond` are those of a whole window. Where the transformer leaves the preview's latents as they are,
-    decoding them and adding this gives the reconstruction's own picture.
+    `cond` is that of a whole window. Where the transformer leaves the preview's latents as they are, decoding them and
+    adding this gives the reconstruction's own picture.
     """
     if not config.fusion.preview:
         return None
-    shown = frames(params, features[-config.frames :], config=config)
     guess = cond.appearance[-config.slots(0) :, ..., MASK_CHANNELS:]
-    return shown - (0.5 + 0.5 * vae.decode_any(params["vae"], guess, cfg=config.vae))
+    blurred = 0.5 + 0.5 * vae.decode_any(params["vae"], guess, cfg=config.vae)
+    return resized(shown, config.height, config.width) - blurred

@@ -1,4 +1,4 @@
-"""What runs in a window of a video, compiled for its shapes: preparation, velocity, decoding, preview; or the preview alone."""
+"""What runs in a window of a video, compiled for its shapes: preparation, velocity, decoding; or the preview alone."""
 
 import functools
 from collections.abc import Callable
@@ -21,7 +21,6 @@ class Programs(NamedTuple):
     prepare: Callable  # (params, views) -> Prepared
     velocity: Callable  # (params, prepared, noise, x, sigma) -> velocity
     decode: Callable  # (params, x0, detail) -> frames [n, h, w, 3]
-    preview: Callable  # (params, features) -> [n, recon_h, recon_w, 3]
 
 
 def velocity(
@@ -57,7 +56,6 @@ def for_window(
         "prepare": jit(fix(model.prepare, config=config)),
         "velocity": jit(fix(velocity, config=config, slots=slots)),
         "decode": jit(fix(decode, config=config, contexts=m)),
-        "preview": jit(lambda p, features: model.decode_rgb(p, features[m:], config=config)),
     }
 
     shapes = sharding.shapes
@@ -71,7 +69,6 @@ def for_window(
         "prepare": (weights, seen),
         "velocity": (weights, prepared, state, state, sigma),
         "decode": (weights, state, prepared.detail),
-        "preview": (weights, prepared.features),
     }
     # Tracing holds Python's lock, compiling does not.
     lowered = {name: pieces[name].lower(*shape) for name, shape in arguments.items()}
@@ -90,14 +87,14 @@ def rgb_head(
     params: Tree, views: model.Views, *, config: RoGeConfig, scene_tokens: jax.Array | None = None
 ) -> jax.Array:
     """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3]; the photos' rays are not queried."""
-    tokens, m = scene_tokens, views["context_rgb"].shape[0]
+    tokens = scene_tokens
     tokens = model.reconstruct(params, views, config=config) if tokens is None else tokens
     if config.renderer.refinement == "shared":  # its refinement reads the rays of the photos
-        features = model.query_rays(params, tokens, views, config=config)[m:]
-    else:
-        targets = views | {"K": views["K"][m:], "c2w": views["c2w"][m:]}
-        features = model.query_rays(params, tokens, targets, config=config, context=views)
-    return model.decode_rgb(params, features, config=config)
+        features = model.query_rays(params, tokens, views, config=config)
+        return model.show(params, features, views, config=config)
+    targets = model.only_targets(views)
+    features = model.query_rays(params, tokens, targets, config=config, context=views)
+    return model.decode_rgb(params, features, targets, config=config, context=views)
 
 
 def for_preview(

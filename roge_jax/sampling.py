@@ -291,7 +291,7 @@ def sample(
         with stage("decode"):
             # Copies: on a CPU a view would keep the device's array alive.
             frames.append(np.array(run.decode(params, x0, prepared.detail))[:n])
-            previews.append(np.array(run.preview(params, prepared.features))[:n])
+            previews.append(np.array(prepared.shown)[:n])
         evaluations += count
     bar.close()
     return Result(

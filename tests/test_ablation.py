@@ -1,5 +1,6 @@
 """The ablation: what it changes is what it says, its rank arithmetic, its verdicts."""
 
+import dataclasses
 import sys
 from pathlib import Path
 
@@ -204,3 +205,21 @@ def test_the_preview_stands_beside_the_flow_errors():
     assert "taken for x0: 0.200." in with_preview
     assert "+0.250 [+0.250, +0.250]" in with_preview
     assert "taken for x0" not in report.tables(rows | {"conditions": row})
+
+
+def test_the_look_up_stands_beside_the_rgb_head(monkeypatch):
+    monkeypatch.setattr(reconstruction, "PHOTOS", (2,))
+    config = dataclasses.replace(TINY, renderer=dataclasses.replace(TINY.renderer, lookup=8))
+    params = model.init(jax.random.key(0), config)
+    row = reconstruction.look_up(params, config, scenes=2)
+    head, photos, both = np.array(row["psnr"][2])
+    assert head.shape == (2,) and np.all((head > 5) & (head < 40))
+    assert np.all(head != photos) and np.all(both != head)
+    rows = {"base": made_up([10.0, 20.0], "seed"), "base, seed 1": made_up([10.0, 20.5], "seed")}
+    made = {
+        "group": "look-up",
+        "parts": row["parts"],
+        "psnr": {"3": [[10, 20], [11, 21], [12, 22]]},
+    }
+    table = report.tables(rows | {"look-up": made})
+    assert "| 3 | 15.00 | 16.00 | 17.00 | +2.00 [+2.00, +2.00] |" in table

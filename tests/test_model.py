@@ -110,10 +110,10 @@ def test_the_photometric_term_is_the_error_of_the_rgb_head_on_all_views():
     rng = np.random.default_rng(0)
     grid = (CONFIG.recon_height // 8, CONFIG.recon_width // 8)
     features = jnp.asarray(rng.standard_normal((M + N, *grid, CONFIG.renderer.width)), jnp.float32)
-    rgb = model.decode_rgb(whole(), features, config=CONFIG)
+    rgb = model.decode_rgb(whole(), features, views, config=CONFIG)
     truth = np.concatenate([views["context_rgb"], views["target_rgb"]])
     want = np.square(np.asarray(rgb, np.float64) - truth).mean()
-    got = model.photometric(whole(), features, views, config=CONFIG)
+    got = model.photometric(rgb, views, config=CONFIG)
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 

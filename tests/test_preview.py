@@ -24,7 +24,7 @@ def test_the_preview_stands_where_the_targets_have_zeros(shrink):
     config = shrunk(PREVIEW, shrink)
     known, features, views = made_condition(config)
     cond = model.condition(whole(), known, features, views, config=config)
-    frames = model.decode_rgb(whole(), features[M:], config=config)
+    frames = model.decode_rgb(whole(), features, views, config=config)[M:]
     if shrink > 1:
         frames = jax.image.resize(frames, (N, config.height, config.width, 3), "bilinear")
     latents = model.encode_targets(whole(), frames, config=config)
@@ -114,8 +114,9 @@ def test_latents_left_as_they_are_come_out_as_the_reconstructions_own_picture(sh
     config = shrunk(ABOUT, shrink)
     known, features, views = made_condition(config)
     cond = model.condition(whole(), known, features, views, config=config)
-    detail = preview.lost_detail(whole(), features, cond, config=config)
-    shown = preview.frames(whole(), features[M:], config=config)
+    shown = model.show(whole(), features, views, config=config)
+    detail = preview.lost_detail(whole(), shown, cond, config=config)
+    shown = model.resized(shown, config.height, config.width)
     left = cond.appearance[M:, ..., 4:]
     decode = functools.partial(model.decode_video, whole(), config=config)
     blurred = decode(left)
@@ -133,7 +134,7 @@ def test_latents_left_as_they_are_come_out_as_the_reconstructions_own_picture(sh
 def test_what_is_prepared_holds_the_detail_where_there_is_a_preview():
     views = {k: jnp.asarray(v) for k, v in sample(4).items() if k != "target_rgb"}
     ready = jax.jit(functools.partial(model.prepare, config=ABOUT))(whole(), views)
-    want = preview.lost_detail(whole(), ready.features, ready.condition, config=ABOUT)
+    want = preview.lost_detail(whole(), ready.shown, ready.condition, config=ABOUT)
     np.testing.assert_allclose(ready.detail, want, atol=1e-5)
     assert ready.detail.shape == (N, CONFIG.height, CONFIG.width, 3)
     plain = functools.partial(model.prepare, config=CONFIG)

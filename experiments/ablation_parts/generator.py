@@ -52,8 +52,8 @@ def told(params: Tree, views: model.Views, features: jax.Array, *, config: RoGeC
         "rays": plucker(views["K"], views["c2w"], config.height, config.width),
         "features": fusion.standardised(features, config),
     }
-    photos = views["context_rgb"].shape[0]
-    latents = preview.latents(params, features[photos:], config=config)
+    shown = model.show(params, features, views, config=config)
+    latents = preview.latents(params, shown, config=config)
     return found if latents is None else found | {"preview": latents}
 
 
@@ -280,7 +280,8 @@ def lora(
         clip = {"x0": x0, "known": x0[:CONTEXTS], "seen": x0[:CONTEXTS]}
         clip |= told(params, views, features, config=config)
         sigmas = jnp.asarray(SIGMAS, jnp.float32)
-        photometric = model.photometric(params, features, views, config=config)
+        rgb = model.decode_rgb(params, features, views, config=config)
+        photometric = model.photometric(rgb, views, config=config)
         return errors_by_sigma(params, clip, key, sigmas, config=config), photometric
 
     latents = encode_all(params, batches, config)["x0"]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from roge_jax import cost, model
@@ -13,11 +14,14 @@ from roge_jax.config import RoGeConfig, to_dict
 from roge_jax.core.params import Tree, count, flatten, unflatten
 from roge_jax.core.params import init as init_specs
 from roge_jax.data.views import ViewConfig
+from roge_jax.recon.picture import decode_all
 from roge_jax.recon.vggt import encoder_grid
 from roge_jax.training import loop, stages
 from roge_jax.training.optim import make_optimiser, muon_dimensions
 
 from .common import CONTEXTS, SCENES, Clock, heldout
+
+PHOTOS = (1, 2, 3, 4, 6)
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,28 @@ def program(variant: Variant, config: RoGeConfig, steps: int):
         return stages.recon_objective(hidden, frozen, batch, key, config=config, stage=stage)
 
     return stage, config, specs, objective, make_optimiser(stage.optim, specs, steps)
+
+
+def look_up(params: Tree, config: RoGeConfig, scenes: int = SCENES) -> dict[str, Any]:
+    """PSNR per held-out scene of the RGB head, of the photos' colours alone and of both, for 1 to 6 photos."""
+
+    @jax.jit
+    def score(params, views):
+        tokens = model.reconstruct(params, views, config=config)
+        targets = model.only_targets(views)
+        features = model.query_rays(params, tokens, targets, config=config, context=views)
+        shown = decode_all(params, features, targets, config=config, context=views)
+        truth = views["target_rgb"]
+        return [jnp.square(x - truth).mean() for x in (shown.head, shown.photos, shown.rgb)]
+
+    base = stages.find_stage(stages.mini_stages(), "lookup")
+    found = {}
+    for m in PHOTOS:
+        views = dataclasses.replace(base.views, contexts=(m,), context_weights=(1.0,), targets=8)
+        batches = heldout(dataclasses.replace(base, views=views), config, scenes)
+        errors = [score(params, {k: x[0] for k, x in batch.items()}) for batch in batches]
+        found[m] = (-10 * np.log10(np.array(errors).T)).tolist()
+    return {"group": "look-up", "parts": ["RGB head", "photos alone", "both"], "psnr": found}
 
 
 def train(

@@ -62,6 +62,16 @@ def tables(rows: dict[str, dict]) -> str:
             f"| {name} | {row['parameters'] / 1e6:.2f} | {row['steps']} | {row['core_seconds']:.0f} | "
             f"{np.mean(row['psnr']):.2f} | {shown if name != 'base' else ''} | {early:+.2f} | {word} |"
         )
+    if "look-up" in rows:
+        row = rows["look-up"]
+        lines += ["", "| photos | " + " | ".join(row["parts"]) + " | both over RGB head [95 %] |"]
+        lines += ["|---" * (len(row["parts"]) + 2) + "|"]
+        for m, each in row["psnr"].items():
+            d = bootstrap(np.subtract(each[-1], each[0]))
+            cells = " | ".join(f"{np.mean(x):.2f}" for x in each)
+            lines.append(
+                f"| {m} | {cells} | {d['mean']:+.2f} [{d['low']:+.2f}, {d['high']:+.2f}] |"
+            )
     if "conditions" in rows:
         found = {n: np.asarray(e) for n, e in rows["conditions"]["errors"].items()}
         whole = found["all conditions"]
@@ -117,7 +127,7 @@ def tables(rows: dict[str, dict]) -> str:
                 f"| {label} | {np.mean(loss['flow']):.4f} | {change if name != str(row['rank']) else ''} | "
                 f"{1000 * np.mean(loss['photometric']):.3f} |"
             )
-    missing = [n for n in (*VARIANTS, "conditions", "finetune", "lora") if n not in rows]
+    missing = [n for n in (*VARIANTS, "look-up", "conditions", "finetune", "lora") if n not in rows]
     if missing:
         lines += ["", f"Not run yet: {', '.join(missing)}."]
     return "\n".join(lines)

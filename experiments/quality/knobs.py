@@ -59,7 +59,6 @@ def over_photos(
     targets.
     """
     records = []
-    rgb = jax.jit(jax.vmap(functools.partial(model.decode_rgb, config=config), in_axes=(None, 0)))
     for m in PHOTOS:
         prepare = preparer(config)
         scenes = known.get(m) or assemble(params, sequences, config, m)
@@ -75,7 +74,7 @@ def over_photos(
         ):
             more, scores = sampled(weights, config, batch)
             records.append(record("M", m, method, scores, prepare_seconds=prepare_seconds, **more))
-        heads = np.asarray(rgb(params, scenes.prepared.features))[:, m:]
+        heads = np.asarray(scenes.prepared.shown)
         records.append(record("M", m, "RGB head", judge.scores(heads)))
         for method, frames in simple(scenes).items():
             records.append(record("M", m, method, judge.scores(frames)))

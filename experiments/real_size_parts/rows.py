@@ -179,7 +179,7 @@ def job(row: Row, dtype: Any) -> Job:
 
         def pictures(p, z, targets, views):
             features = model.query_rays(p, z, targets, config=cfg, context=views)
-            return model.decode_rgb(p, features, config=cfg)
+            return model.decode_rgb(p, features, targets, config=cfg, context=views)
 
         flops = n * cost.renderer_view(cfg.renderer, *size, m * grid[0] * grid[1])
         return compiled(pictures, pick("renderer"), z, targets, views, flops=flops, frames=n)
@@ -194,7 +194,7 @@ def job(row: Row, dtype: Any) -> Job:
 
 
 def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise: jax.Array) -> Job:
-    """As `python -m roge_jax.sample` does it: reconstruction, rays, encoding, 50 Euler steps, decoding, preview."""
+    """As `python -m roge_jax.sample` does it: reconstruction, rays, encoding, 50 Euler steps, decoding."""
     start = time.perf_counter()
     run = programs.for_window(params, views, cfg, "noised")
     seconds = time.perf_counter() - start
@@ -207,12 +207,7 @@ def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise
             "euler", lambda x, s: run.velocity(params, prepared, noise, x, s), noise, sigmas
         ):
             x = state
-        return jax.block_until_ready(
-            (
-                run.decode(params, x, prepared.detail),
-                run.preview(params, prepared.features),
-            )
-        )
+        return jax.block_until_ready((run.decode(params, x, prepared.detail), prepared.shown))
 
     return Job(call, cost.estimate(cfg, m, 50).total_flops, seconds)
 

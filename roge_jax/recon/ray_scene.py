@@ -25,6 +25,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, normal, stack, zeros
 from ..core.sharding import constrain, ways
+from .lookup import lookup_specs
 from .relative import Relative, inside, to_key, to_output, to_query
 
 EPS = 1e-5
@@ -192,7 +193,7 @@ def merge_scene(
 
 
 def renderer_specs(cfg: RendererConfig) -> Tree:
-    """Leaves of ray embedding, registers, `cfg.depth` blocks of the form `cfg.attention`, and RGB head."""
+    """Leaves of ray embedding, registers, `cfg.depth` blocks of the form `cfg.attention`, RGB head, and photo look-up if there is one."""
     d, heads, depth = cfg.width, cfg.heads, cfg.depth
     specs = {
         "registers": Spec((cfg.registers, d), (None, "embed"), normal(0.02)),
@@ -203,6 +204,8 @@ def renderer_specs(cfg: RendererConfig) -> Tree:
             "linear": linear_specs(d, 3 * cfg.patch**2, ("embed", None), bias=False, init=zeros),
         },
     }
+    if cfg.lookup:
+        specs["lookup"] = lookup_specs(d, cfg.patch, cfg.lookup)
     if cfg.attention == "bidirectional":
         specs["blocks"] = stack(bidirectional_block_specs(d, heads, depth), depth - 1)
         specs["last_block"] = cross_block_specs(d, heads, depth)

@@ -19,6 +19,7 @@ from ..core.lora import attach
 from ..core.params import Tree
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
+from ..recon.picture import decode_all
 from ..video import dit, vae, vae_training
 from .optim import OptimConfig
 
@@ -37,6 +38,7 @@ class Stage:
     remat: dit.Remat = "dots"  # what the transformer's backward pass recomputes
     crop: int | None = None  # side of random square crops (VAE stages)
     recon_shrink: int = 1  # divides the size at which the reconstruction works
+    lookup: bool = False  # train the photo look-up on a finished reconstruction
     about_preview: bool = False  # measure the preview first, if nobody has: `measure_preview`
 
 
@@ -51,19 +53,30 @@ def vae_objective(trainable, frozen, batch, key, *, config, stage):
 
 
 def recon_objective(trainable, frozen, batch, key, *, config, stage):
-    """Photometric loss of the RGB head on the targets."""
+    """Photometric loss of the RGB head on the targets; of the photo look-up and its two levels in its own stage."""
     params = attach(frozen, trainable)
+    if not stage.lookup:
+        config = dataclasses.replace(
+            config, renderer=dataclasses.replace(config.renderer, lookup=0)
+        )
 
     def scene(views):
-        m = views["context_rgb"].shape[0]
         tokens = model.reconstruct(params, views, config=config)
-        targets = views | {"K": views["K"][m:], "c2w": views["c2w"][m:]}
+        targets = model.only_targets(views)
         features = model.query_rays(params, tokens, targets, config=config, context=views)
-        truth = model.resized(views["target_rgb"], config.recon_height, config.recon_width)
-        return jnp.square(model.decode_rgb(params, features, config=config) - truth).mean()
+        shown = decode_all(params, features, targets, config=config, context=views)
 
-    mse = model.over_scenes(scene, batch).mean()
-    return mse, {"psnr": -10 * jnp.log10(mse)}
+        def error(rgb):
+            return jnp.square(rgb - model.resized(views["target_rgb"], *rgb.shape[1:3])).mean()
+
+        return {part: error(getattr(shown, part)) for part in ("rgb", "photos", "coarse")}
+
+    terms = {name: value.mean() for name, value in model.over_scenes(scene, batch).items()}
+    told = {"psnr": -10 * jnp.log10(terms["rgb"])}
+    if not stage.lookup:
+        return terms["rgb"], told
+    loss = terms["rgb"] + LEVELS * (terms["photos"] + terms["coarse"])
+    return loss, told | {"psnr_photos": -10 * jnp.log10(terms["photos"])}
 
 
 def prior_objective(trainable, frozen, batch, key, *, config, stage):
@@ -91,6 +104,8 @@ def joint_objective(trainable, frozen, batch, key, *, config, stage):
     )
 
 
+LEVELS = 0.3  # weight of the look-up's levels beside its picture
+
 READS = {"vae": "^vae/", "recon": "^(encoder|renderer)/"}  # other objectives read the whole model
 
 OBJECTIVES = {
@@ -107,21 +122,27 @@ _SCRATCH = OptimConfig(
 _GENTLE = dataclasses.replace(_SCRATCH, learning_rate=1e-3)
 
 
+# Small convolutions, many with one output: Muon was not tried.
+_SMALL = dataclasses.replace(_SCRATCH, name="adamw", warmup=30, betas=(0.9, 0.98))
+
+RECON = "^(encoder|renderer/(?!lookup/))"  # all of the reconstruction but the look-up
+
+
 def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
     video = ViewConfig(targets=frames, ordered=True)
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
+    few = ViewConfig(targets=4, near=0.3)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
         # Whole windows: after short clips alone, frames from the sixth on lose up to 6 dB.
         Stage("vae_longer", "vae", "^vae/", 1500, 1, _GENTLE, video, crop=64),
-        Stage(
-            "recon_low", "recon", "^(encoder|renderer)/", 3000, 16, _SCRATCH, views, recon_shrink=2
-        ),
-        Stage("recon", "recon", "^(encoder|renderer)/", 3000, 8, _SCRATCH, ViewConfig(targets=6)),
+        Stage("recon_low", "recon", RECON, 3000, 16, _SCRATCH, views, recon_shrink=2),
+        Stage("recon", "recon", RECON, 3000, 8, _SCRATCH, ViewConfig(targets=6)),
+        Stage("lookup", "recon", "^renderer/lookup/", 3000, 3, _SMALL, few, lookup=True),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
         Stage(
             "generator",
@@ -281,10 +302,10 @@ def measure_preview(
     """
 
     def error(params, views):
-        m = views["context_rgb"].shape[0]
         tokens = model.reconstruct(params, views, config=config)
         features = model.query_rays(params, tokens, views, config=config)
-        guess = preview.latents(params, features[m:], config=config)
+        shown = model.show(params, features, views, config=config)
+        guess = preview.latents(params, shown, config=config)
         return model.encode_targets(params, views["target_rgb"], config=config) - guess
 
     values = _on_clips(error, params, source, config, seed, clips)

@@ -1,0 +1,323 @@
+"""Photo look-up: every ray looks into the photos along its epipolar lines and brings back their own colours.
+
+Not in the paper (`RendererConfig.lookup`, on in `mini`): a renderer trained for hours instead of weeks puts things where
+they belong but blurs them, and what it lost is in the photos. As in plane sweeping (Collins 1996; Yao et al. 2018,
+"MVSNet") a ray is cut at many inverse depths, but nothing is told what depth is right: the distribution over the cuts is
+an attention, learned from the photometric term alone, and no depth map, point or other 3D thing leaves this module.
+
+1. Coarse, per cell of 4 x 4 pixels: at each of `RendererConfig.lookup` cuts, how well do features of the photos agree
+   where the cut projects to? Together with what the ray features say, that gives logits over the cuts.
+2. Fine, per pixel: a few cuts about the coarse answer, and the photos' colours there.
+3. Which photo is right (near, agreeing with the others and with the RGB head), and whether any is: a mixture of the
+   photos' colours and the RGB head's.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..core.layers import (
+    conv2d,
+    conv2d_specs,
+    layer_norm,
+    linear,
+    linear_specs,
+    norm_specs,
+    unpatchify,
+)
+from ..core.params import Spec, Tree, fan_in, stack, zeros
+
+CELL = 4  # pixels, along both axes
+NEAREST = (
+    0.25  # depth of the last cut, in units of the normalised scene; the first one is at infinity
+)
+SPACING = 1.5  # exponent: cuts are denser towards infinity
+BLOCKS, WIDTH, MATCHED = 3, 16, 8  # coarse network; channels of the photos' features
+FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
+ALONG = 5  # neighbouring cuts that a coarse block sees
+UNSEEN = -8.0  # logit of cuts that no photo sees
+BEHIND = 1e-3  # depths in a photo below this are behind it
+EPS = 1e-5
+
+
+class Looked(NamedTuple):
+    """What rays found in the photos."""
+
+    rgb: jax.Array  # [v, h, w, 3] the picture
+    head: jax.Array  # [v, h, w, 3] the RGB head's
+    photos: jax.Array  # [v, h, w, 3] its part from the photos alone
+    coarse: jax.Array  # [v, h / 4, w / 4, 3] the photos' colours under the coarse distribution
+
+
+def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
+    """Leaves for ray features of width `d`, `patch` pixels a side."""
+    cells, linears = (patch // CELL) ** 2, (None, None)
+    along = {
+        "kernel": Spec((ALONG, WIDTH, WIDTH), (None,) * 3, fan_in(0.5)),
+        "bias": Spec((WIDTH,), (None,), zeros),
+    }
+    return {
+        "features": {
+            "conv1": conv2d_specs(3, 16, 3),
+            "conv2": conv2d_specs(16, 16, 3),
+            "conv3": conv2d_specs(16, MATCHED, 3),
+        },
+        "norm": norm_specs(d, bias=False),
+        "prior": linear_specs(d, cells * (cuts + WIDTH), linears, init=zeros),
+        "enter": linear_specs(MATCHED + 3 + 2 + 1 + WIDTH, WIDTH, linears),
+        "blocks": stack({"space": conv2d_specs(WIDTH, WIDTH, 3), "along": along}, BLOCKS),
+        "score": linear_specs(WIDTH, 1, linears),
+        "upsample": linear_specs(2 * WIDTH, 9 * CELL**2, linears, init=zeros),
+        "fine": {
+            "conv1": conv2d_specs(8 * FINE, WIDTH, 3),
+            "conv2": conv2d_specs(WIDTH, WIDTH, 3),
+            "conv3": conv2d_specs(WIDTH, FINE, 3),
+        },
+        "choose": {"conv1": conv2d_specs(11, WIDTH, 3), "conv2": conv2d_specs(WIDTH, 1, 3)},
+        "merge": {
+            "conv1": conv2d_specs(14, WIDTH, 3),
+            "conv2": conv2d_specs(WIDTH, WIDTH, 3),
+            "conv3": conv2d_specs(WIDTH, 4, 3, init=zeros),
+        },
+    }
+
+
+class Motion(NamedTuple):
+    """From a view's homogeneous pixel x at inverse depth w to a photo's: turn @ x + w * shift."""
+
+    turn: jax.Array  # [v, m, 3, 3]
+    shift: jax.Array  # [v, m, 3]
+
+
+def motion(K: jax.Array, c2w: jax.Array, photo_K: jax.Array, photo_c2w: jax.Array) -> Motion:
+    """`Motion` from v views to m photos: K [., 3, 3] in pixels, c2w [., 4, 4]; depth is z of the view."""
+    with jax.default_matmul_precision("highest"):
+        inverse = jnp.swapaxes(photo_c2w[:, :3, :3], 1, 2)
+        turn = jnp.einsum("mij,vjk->vmik", inverse, c2w[:, :3, :3])
+        apart = c2w[:, None, :3, 3] - photo_c2w[None, :, :3, 3]
+        turn = jnp.einsum("mij,vmjk,vkl->vmil", photo_K, turn, jnp.linalg.inv(K))
+        return Motion(turn, jnp.einsum("mij,mjk,vmk->vmi", photo_K, inverse, apart))
+
+
+def inverse_depth(cut: jax.Array, cuts: int) -> jax.Array:
+    """1 / depth of a cut, a number between 0 and `cuts` - 1 that need not be whole."""
+    return (jnp.maximum(cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
+
+
+def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
+    """Values of m images [m, h, w, c] where one view's rays meet their cuts: ([m, k, p, c], seen [m, k, p] 0 or 1).
+
+    `way`: one view's motion in pixels of `images`; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. Bilinear,
+    border repeated; a cut is seen if it lies in front of the photo and inside its frame.
+    """
+    m, h, w, _ = images.shape
+    ones = jnp.ones((len(pixels), 1))
+    start = jnp.einsum("mij,pj->mpi", way.turn, jnp.concatenate([pixels, ones], -1))
+    q = start[:, None] + inverse[None, :, :, None] * way.shift[:, None, None]
+    front = q[..., 2] > BEHIND
+    z = jnp.where(front, q[..., 2], 1.0)
+    x, y = (jnp.where(front, q[..., i] / z, -1.0) for i in (0, 1))
+    seen = front & (x >= 0) & (y >= 0) & (x <= w) & (y <= h)
+    x, y = jnp.clip(x - 0.5, 0.0, w - 1.001), jnp.clip(y - 0.5, 0.0, h - 1.001)
+    left, top = jnp.floor(x), jnp.floor(y)
+    fx, fy = (x - left)[..., None], (y - top)[..., None]
+    # A row holds the four neighbours of a sample: one gather instead of four.
+    corners = [images[:, i : h - 1 + i, j : w - 1 + j] for i in (0, 1) for j in (0, 1)]
+    quads = jnp.concatenate(corners, -1).reshape(m * (h - 1) * (w - 1), -1)
+    first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
+    index = (top * (w - 1) + left).astype(jnp.int32) + first[:, None, None]
+    a, b, c, d = jnp.split(quads.at[index].get(mode="promise_in_bounds"), 4, -1)
+    upper, lower = a + fx * (b - a), c + fx * (d - c)
+    return upper + fy * (lower - upper), seen.astype(jnp.float32)
+
+
+def agreement(values: jax.Array, seen: jax.Array):
+    """Mean and standard deviation over the photos that see a cut, and their number: values [m, .., c], seen [m, ..].
+
+    Fewer than two photos agree on nothing: their deviation is that of strangers.
+    """
+    n = seen.sum(0)[..., None]
+    share = seen[..., None] / jnp.maximum(n, 1.0)[None]
+    mean = (values * share).sum(0)
+    variance = (jnp.square(values - mean[None]) * share).sum(0) * n / jnp.maximum(n - 1.0, 1.0)
+    return mean, jnp.sqrt(jnp.where(n >= 2, variance, 0.1) + 1e-4), n
+
+
+def _pixels(h: int, w: int, step: int) -> jax.Array:
+    """Centres [h * w, 2] = (x, y) of cells of `step` pixels."""
+    y, x = np.mgrid[:h, :w] * step + 0.5 * step
+    return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
+
+
+def _cells(images: jax.Array) -> jax.Array:
+    """Means of cells: [v, h, w, 3] -> [v, h / 4, w / 4, 3]."""
+    v, h, w, c = images.shape
+    return images.reshape(v, h // CELL, CELL, w // CELL, CELL, c).mean((2, 4))
+
+
+@jax.named_scope("look_up")
+def look_up(
+    p: Tree,
+    features: jax.Array,
+    head: jax.Array,
+    photos: jax.Array,
+    cameras: tuple[jax.Array, jax.Array],
+    photo_cameras: tuple[jax.Array, jax.Array],
+    *,
+    cuts: int,
+) -> Looked:
+    """Ray features [v, gh, gw, d] and the RGB head's picture of them [v, h, w, 3] -> `Looked`.
+
+    photos [m, h, w, 3] in [0, 1]; cameras (K, c2w) of the v views and of the m photos, in the normalised frame.
+    """
+    v, gh, gw, d = features.shape
+    h, w = photos.shape[1:3]
+    size = ch, cw = h // CELL, w // CELL
+    way = motion(*cameras, *photo_cameras)
+    maps = jnp.concatenate([_features(p["features"], photos), _cells(photos)], -1)
+    tokens = layer_norm(p["norm"], features.reshape(v, gh * gw, d), eps=EPS)
+    tokens = unpatchify(linear(p["prior"], tokens), (gh, gw), ch // gh)
+    prior, context = tokens[..., :cuts], tokens[..., cuts:]
+
+    shrink = jnp.asarray([1 / CELL, 1 / CELL, 1.0])
+    shrunk = Motion(shrink[None, None, :, None] * way.turn, shrink[None, None] * way.shift)
+    low = _cells(head)
+    coarse = jax.vmap(jax.checkpoint(lambda *a: _coarse(p, maps, *a)))
+    colours, cut, sure, hidden = coarse(shrunk, prior, context, low)
+
+    weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
+    weights = jax.nn.softmax(weights.reshape(v, ch, cw, CELL**2, 9), -1)
+
+    def upsampled(x):  # [v, ch, cw] -> [v, h, w], every pixel a mean of the nine cells around it
+        x = jnp.pad(x, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        nine = jnp.stack([x[:, i : i + ch, j : j + cw] for i in range(3) for j in range(3)], -1)
+        x = (weights * nine[..., None, :]).sum(-1)
+        return unpatchify(x.reshape(v, ch * cw, CELL**2), size, CELL)[..., 0]
+
+    fine = jax.vmap(jax.checkpoint(lambda *a: _fine(p["fine"], photos, cuts, *a)))
+    found, seen, cut = fine(way, upsampled(cut), head)
+    far = _distance(cameras[1], photo_cameras[1], inverse_depth(cut, cuts))
+    looked, some, scene = _chosen(p["choose"], found, seen, far, head)
+    rgb = _merged(
+        p["merge"], head, looked, some, jnp.concatenate([scene, upsampled(sure)[..., None]], -1)
+    )
+    return Looked(rgb, head, looked, colours)
+
+
+def _features(p: Tree, photos: jax.Array) -> jax.Array:
+    """Photos [m, h, w, 3] -> what is compared [m, h / 4, w / 4, c]."""
+    y = jax.nn.relu(conv2d(p["conv1"], photos - 0.5, stride=2))
+    y = jax.nn.relu(conv2d(p["conv2"], y, stride=2))
+    return conv2d(p["conv3"], y)
+
+
+def _coarse(p: Tree, maps, way: Motion, prior, context, head):
+    """One view's distribution over the cuts of a cell, from prior [ch, cw, k] and context [ch, cw, c].
+
+    Returns the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there [ch, cw], and the hidden
+    state [ch, cw, c].
+    """
+    ch, cw, cuts = prior.shape
+    numbers = jnp.arange(cuts, dtype=jnp.float32)
+    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, ch * cw))
+    values, seen = fetch(maps, way, _pixels(ch, cw, CELL), inverse)
+    mean, deviation, n = (x.reshape(cuts, ch, cw, -1) for x in agreement(values, seen))
+    prior = jnp.moveaxis(prior, -1, 0)
+    colour = mean[..., MATCHED:]
+    evidence = [
+        deviation[..., :MATCHED],
+        jnp.abs(colour - head[None]),
+        (n >= 1).astype(jnp.float32),
+        (n >= 2).astype(jnp.float32),
+        prior[..., None],
+        jnp.broadcast_to(context[None], (cuts, *context.shape)),
+    ]
+    y = linear(p["enter"], jnp.concatenate(evidence, -1))
+    for i in range(BLOCKS):
+        block = jax.tree.map(lambda leaf, i=i: leaf[i], p["blocks"])
+        y = y + conv2d(block["space"], jax.nn.relu(y))
+        near = jnp.pad(jax.nn.relu(y), ((ALONG // 2,) * 2, (0, 0), (0, 0), (0, 0)))
+        near = jnp.concatenate([near[j : j + cuts] for j in range(ALONG)], -1)
+        along = block["along"] | {"kernel": block["along"]["kernel"].reshape(-1, WIDTH)}
+        y = y + linear(along, near)
+    logits = linear(p["score"], jax.nn.relu(y))[..., 0] + prior + UNSEEN * (n[..., 0] < 1)
+    share = jax.nn.softmax(logits, 0)
+    colours = (share[..., None] * jnp.where(n > 0, colour, head[None])).sum(0)
+    # The mean over all cuts lies between two surfaces and on neither: only the peak and its neighbours count.
+    peak = jax.lax.stop_gradient(jnp.argmax(logits, 0))
+    about = share * (jnp.abs(numbers[:, None, None] - peak[None]) <= 2)
+    mass = about.sum(0)
+    cut = (about * numbers[:, None, None]).sum(0) / mass
+    return colours, cut, mass, (share[..., None] * y).sum(0)
+
+
+def _fine(p: Tree, photos, cuts: int, way: Motion, cut, head):
+    """One view's colours in every photo [m, h, w, 3] about the cut [h, w], how much of them is seen [m, h, w, 1], and the
+    cut itself, refined.
+    """
+    h, w = cut.shape
+    offsets = jnp.asarray((np.arange(FINE) - (FINE - 1) / 2) / 4, jnp.float32)
+    inverse = inverse_depth(offsets[:, None] + cut.reshape(1, -1), cuts)
+    values, seen = fetch(photos, way, _pixels(h, w, 1), inverse)
+    mean, deviation, n = (x.reshape(FINE, h, w, -1) for x in agreement(values, seen))
+    counts = [(n >= 1).astype(jnp.float32), (n >= 2).astype(jnp.float32)]
+    y = jnp.concatenate([deviation, jnp.abs(mean - head[None]), *counts], -1)
+    y = jnp.moveaxis(y, 0, 2).reshape(1, h, w, -1)
+    y = jax.nn.relu(conv2d(p["conv1"], y))
+    y = y + jax.nn.relu(conv2d(p["conv2"], y))
+    logits = jnp.moveaxis(conv2d(p["conv3"], y)[0], -1, 0) + UNSEEN * (n[..., 0] < 1)
+    share = jax.nn.softmax(logits, 0)
+    refined = cut + (share * offsets[:, None, None]).sum(0)
+    share = share.reshape(1, FINE, h * w, 1)
+    m = len(photos)
+    found = (share * values).sum(1).reshape(m, h, w, 3)
+    return found, (share * seen[..., None]).sum(1).reshape(m, h, w, 1), refined
+
+
+def _distance(c2w, photo_c2w, inverse) -> jax.Array:
+    """How far photos are from views as `metrics.baselines.view_distances` says it, per pixel [v, m, h, w, 1]:
+    distance of the centres over the depth, and the angle between the cameras as a chord.
+    """
+    centres = c2w[:, None, :3, 3] - photo_c2w[None, :, :3, 3]
+    turns = c2w[:, None, :3, :3] - photo_c2w[None, :, :3, :3]
+    apart, chord = (
+        jnp.sqrt(jnp.square(centres).sum(-1)),
+        jnp.sqrt(jnp.square(turns).sum((-1, -2)) / 2),
+    )
+    return (apart[:, :, None, None] * inverse[:, None] + chord[:, :, None, None])[..., None]
+
+
+def _chosen(p: Tree, found, seen, far, head):
+    """The photos' colours [v, m, h, w, 3] weighed: (colour [v, h, w, 3], how much of it is seen [v, h, w, 1], two numbers
+    per pixel about the choice [v, h, w, 2]).
+
+    The choice starts from 1 / distance^2 among photos that see the cut.
+    """
+    v, m, h, w, _ = found.shape
+    mean = (found * seen).sum(1, keepdims=True) / jnp.maximum(seen.sum(1, keepdims=True), 1.0)
+    nearest = far.min(1, keepdims=True)
+    odd = jnp.abs(found - mean).mean(-1, keepdims=True)
+    ratio = nearest / (far + 1e-3)
+    known = [found - head[:, None], found - mean, odd, seen, far, far - nearest, ratio]
+    y = jnp.concatenate(known, -1).reshape(v * m, h, w, -1)
+    y = conv2d(p["conv2"], jax.nn.relu(conv2d(p["conv1"], y))).reshape(v, m, h, w, 1)
+    near = -2.0 * jnp.log(far / (nearest + 1e-3) + 1e-2)
+    share = jax.nn.softmax(y + jnp.log(seen + 1e-4) + near, 1)
+    looked = (share * found).sum(1)
+    spread = (share * jnp.square(found - looked[:, None])).sum(1).mean(-1, keepdims=True)
+    about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(1)], -1)
+    return looked, (share * seen).sum(1), about
+
+
+def _merged(p: Tree, head, looked, some, about) -> jax.Array:
+    """The RGB head's picture and the photos' colours, mixed and corrected."""
+    change = looked - head
+    odd = jnp.abs(change).mean(-1, keepdims=True)
+    y = jnp.concatenate([head - 0.5, looked - 0.5, change, odd, some, about], -1)
+    y = jax.nn.relu(conv2d(p["conv1"], y))
+    y = y + jax.nn.relu(conv2d(p["conv2"], y))
+    y = conv2d(p["conv3"], y)
+    mixed = head + jax.nn.sigmoid(y[..., :1]) * some * change + y[..., 1:]
+    return jnp.clip(mixed, 0.0, 1.0)
