@@ -32,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
         default="lora",
         help="lora (default): LoRA on both halves + new embeddings, the paper's joint training;\n"
         "hires: the same with the reconstruction frozen, at --size;\n"
-        "vae_images, vae_clips, vae_longer, recon_low, recon, prior, generator, vae_decoder, joint: one stage\n"
+        "vae_images, vae_clips, vae_longer, recon_low, recon, lookup, prior, generator, vae_decoder, joint: one stage\n"
         "of the recipe that makes a small model from nothing; all: all of them in order",
     )
     p.add_argument(
@@ -170,10 +170,18 @@ def choose(args: argparse.Namespace, cfg):
     """(the configuration at --size, the stages that --stage means with everything that the flags change)."""
     from . import model
     from .core.params import count
+    from .errors import UserError
     from .training import plan
     from .training import stages as stages_
 
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames)
+    if not cfg.renderer.lookup:
+        if args.stage == "lookup":
+            raise UserError(
+                f"--stage lookup trains the photo look-up, and this model of '{cfg.name}' has none (renderer.lookup is "
+                "0): start from one that has, such as --init mini, or from scratch."
+            )
+        recipe = [stage for stage in recipe if not stage.lookup]
     if args.stage == "all":
         chosen = recipe
     elif args.stage in ("lora", "hires"):
@@ -397,8 +405,10 @@ def run_stage(args, stage, params, cfg, mesh=None):
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
         cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview_std=None))
-    if stage.objective == "recon":
+    if stage.objective == "recon" and not stage.lookup:
         params, cfg = stages.measure_features(params, source, cfg, args.seed)
+    if stage.lookup and cfg.fusion.preview_std is not None:
+        cfg = stages.measure_spread(params, source, cfg, args.seed)
     provenance = {
         "stage": stage.name,
         "steps": int(state["step"]),

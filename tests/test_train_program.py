@@ -72,6 +72,17 @@ def test_unknown_stage_and_batch_that_does_not_divide_are_refused(tmp_path):
         run("minni", "--out", tmp_path)
 
 
+def test_a_model_without_look_up_has_no_stage_for_it(tmp_path):
+    with pytest.raises(UserError, match=r"renderer\.lookup is 0"):
+        run("tiny", "--stage", "lookup", "--out", tmp_path)
+    args = train.parser().parse_args(["tiny", "--stage", "all"])
+    names = {
+        name: [stage.name for stage in train.choose(args, config.preset(name))[1]]
+        for name in ("tiny", "mini")
+    }
+    assert names["mini"] == [*names["tiny"][:5], "lookup", *names["tiny"][5:]]
+
+
 @pytest.mark.parametrize(
     "words",
     [
@@ -185,6 +196,37 @@ def test_a_generator_is_trained_about_the_preview_once(common, tmp_path, monkeyp
         assert load_model(start)[1].fusion.preview_std == (0.5,) * 16
         monkeypatch.setattr(stages, "measure_preview", None)  # the second run has no need of it
     assert seen == [(0.5,) * 16] * 2  # and the objective knows
+
+
+def test_a_look_up_makes_the_preview_better_and_its_error_is_measured_again(
+    common, tmp_path, monkeypatch
+):
+    cfg = config.preset("tiny")
+    fusion = dataclasses.replace(cfg.fusion, preview=True, preview_std=(0.5,) * cfg.vae.latent)
+    renderer = dataclasses.replace(cfg.renderer, lookup=8)
+    cfg = dataclasses.replace(cfg, fusion=fusion, renderer=renderer)
+    start = model.init(jax.random.key(0), cfg)
+    start["dit"]["head"]["linear"]["kernel"] += 1.0
+    save_model(tmp_path / "start", start, cfg)
+
+    def train_nothing(objective, trainable, *rest, **options):
+        assert set(flatten(trainable)) == {
+            p for p in flatten(model.specs(cfg)) if p.startswith("renderer/lookup/")
+        }
+        (options["out"] / "log.jsonl").touch()
+        return {"params": trainable, "step": 0, "skipped": 0}
+
+    def measure(params, source, cfg, seed):
+        better = dataclasses.replace(cfg.fusion, preview_std=(0.25,) * cfg.vae.latent)
+        return dataclasses.replace(cfg, fusion=better)
+
+    monkeypatch.setattr(stages, "measure_spread", measure)
+    monkeypatch.setattr(stages, "measure_features", None)  # the features did not move
+    monkeypatch.setattr(loop, "train", train_nothing)
+    run(*common, "--stage", "lookup", "--init", tmp_path / "start", "--out", tmp_path / "out")
+    params, found = load_model(tmp_path / "out/lookup/model")
+    assert found.fusion.preview_std == (0.25,) * 16
+    assert np.all(params["dit"]["head"]["linear"]["kernel"] == 1.0)  # and the transformer stays as it is
 
 
 def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):

@@ -292,13 +292,12 @@ def measure_features(
     return params | {"fusion": moved}, dataclasses.replace(config, fusion=measured)
 
 
-def measure_preview(
+def measure_spread(
     params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32
-) -> tuple[Tree, RoGeConfig]:
-    """(params, config) with the preview's root mean square error per latent channel on training clips.
+) -> RoGeConfig:
+    """`config` with the preview's root mean square error per latent channel on training clips.
 
-    What the transformer says means another thing from here on (`preview.velocity`), so its head starts from zero:
-    until it is trained it generates the preview and noise of that size.
+    The unit of what the transformer says: one trained about a worse preview goes on to correct a better one.
     """
 
     def error(params, views):
@@ -313,9 +312,21 @@ def measure_preview(
     measured = dataclasses.replace(
         config.fusion, preview_std=tuple(float(f"{max(x, 1e-3):.4g}") for x in rms)
     )
+    return dataclasses.replace(config, fusion=measured)
+
+
+def measure_preview(
+    params: Tree, source, config: RoGeConfig, seed: int, clips: int = 32
+) -> tuple[Tree, RoGeConfig]:
+    """(params, config) with `measure_spread` and a transformer whose head starts from zero.
+
+    What it says means another thing from here on (`preview.velocity`): until it is trained it generates the preview and
+    noise of that size.
+    """
+    config = measure_spread(params, source, config, seed, clips)
     head = jax.tree.map(jnp.zeros_like, params["dit"]["head"]["linear"])
     transformer = params["dit"] | {"head": params["dit"]["head"] | {"linear": head}}
-    return params | {"dit": transformer}, dataclasses.replace(config, fusion=measured)
+    return params | {"dit": transformer}, config
 
 
 def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, clips: int):
