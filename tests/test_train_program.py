@@ -226,7 +226,9 @@ def test_a_look_up_makes_the_preview_better_and_its_error_is_measured_again(
     run(*common, "--stage", "lookup", "--init", tmp_path / "start", "--out", tmp_path / "out")
     params, found = load_model(tmp_path / "out/lookup/model")
     assert found.fusion.preview_std == (0.25,) * 16
-    assert np.all(params["dit"]["head"]["linear"]["kernel"] == 1.0)  # and the transformer stays as it is
+    assert np.all(
+        params["dit"]["head"]["linear"]["kernel"] == 1.0
+    )  # and the transformer stays as it is
 
 
 def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):

@@ -30,9 +30,7 @@ from ..core.layers import (
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 
 CELL = 4  # pixels, along both axes
-NEAREST = (
-    0.25  # depth of the last cut, in units of the normalised scene; the first one is at infinity
-)
+NEAREST = 0.25  # depth of the last cut in the normalised scene; the first is at infinity
 SPACING = 1.5  # exponent: cuts are denser towards infinity
 BLOCKS, WIDTH, MATCHED = 3, 16, 8  # coarse network; channels of the photos' features
 FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
