@@ -138,7 +138,7 @@ class Engine:
         return dataclasses.replace(full, **changes)
 
     def features(self, scene: LadderScene, choices):
-        """(views, ray features) under choices of photos, size and tokens."""
+        """(views, ray features, picture) under choices of photos, size and tokens."""
         photos, config, _ = sampling.reduced(scene.photos, self.config, self.settings, choices)
         seen = ("views", choices.photos)
         if seen not in scene.kept:
@@ -152,33 +152,30 @@ class Engine:
         if tokens not in scene.kept:
             scene.kept[tokens] = self.program(model.reconstruct, plain)(self.params, views)
         if rays not in scene.kept:
-            query = self.program(model.query_rays, config)
-            scene.kept[rays] = query(self.params, scene.kept[tokens], views)
-        return views, scene.kept[rays]
+            query, show = self.program(model.query_rays, config), self.program(model.show, config)
+            found = query(self.params, scene.kept[tokens], views)
+            scene.kept[rays] = found, show(self.params, found, views)
+        return views, *scene.kept[rays]
 
     def run(self, scene: LadderScene, choices) -> np.ndarray:
         """The frames [n, h, w, 3] under `choices`."""
         if choices in scene.kept:
             return scene.kept[choices]
-        config = self.config
-        views, features = self.features(scene, choices)
+        views, features, shown = self.features(scene, choices)
         if not choices.generate[0]:
-            head = self.program(model.show, config)(self.params, features, views)
-            frames = np.asarray(model.resized(head, config.height, config.width))
+            frames = np.asarray(model.resized(shown, self.config.height, self.config.width))
         else:
-            frames = np.asarray(
-                self.decode(self.params, *self.latents(scene, choices, views, features))
-            )
+            made = self.latents(scene, choices, views, features, shown)
+            frames = np.asarray(self.decode(self.params, *made))
         scene.kept[choices] = frames
         return frames
 
-    def latents(self, scene, choices, views, features) -> tuple[jax.Array, jax.Array | None]:
+    def latents(self, scene, choices, views, features, shown) -> tuple[jax.Array, jax.Array | None]:
         """Those of the targets, and what is added to them when they are decoded."""
         m = len(choices.photos)
         if "latents" not in scene.kept:
             scene.kept["latents"] = self.encode(self.params, scene.photos.images)
         known = scene.kept["latents"][np.array(choices.photos)]
-        shown = self.program(model.show, self.config)(self.params, features, views)
         condition = self.program(model.condition, self.config)
         cond = condition(self.params, known, features, views, shown=shown)
         lost = self.program(preview.lost_detail, self.config)(self.params, shown, cond)
