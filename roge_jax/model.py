@@ -349,9 +349,7 @@ class Prepared(NamedTuple):
 
     context_latents: jax.Array  # [m, lh, lw, 16]
     features: jax.Array  # [m + n, gh, gw, d]
-    shown: (
-        jax.Array
-    )  # [n, recon_height, recon_width, 3], the reconstruction's own picture of the targets
+    shown: jax.Array  # [n, recon_height, recon_width, 3], see `show`
     condition: Condition
     text: Tree | None
     detail: jax.Array | None  # [n, h, w, 3], see `preview.lost_detail`
