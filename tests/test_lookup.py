@@ -11,7 +11,7 @@ from test_cost import abstract, array, multiplied
 
 from roge_jax import cost, model
 from roge_jax.config import RoGeConfig, preset, to_dict
-from roge_jax.core.layers import _conv2d, conv2d
+from roge_jax.core.layers import conv2d, convolve
 from roge_jax.core.params import flatten, init
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import ViewConfig
@@ -221,7 +221,7 @@ def test_gradients_of_convolutions(loop):
 
         return jax.jit(jax.value_and_grad(run, argnums=(0, 1)))(p, x)
 
-    plain = lambda p, x: _conv2d(x, p["kernel"], 1) + p["bias"].reshape(1, 1, 1, -1)  # noqa: E731
+    plain = lambda p, x: convolve(x, p["kernel"]) + p["bias"].reshape(1, 1, 1, -1)  # noqa: E731
     (a, da), (b, db) = total(conv2d), total(plain)
     np.testing.assert_allclose(a, b, rtol=1e-6)
     for got, want in zip(jax.tree.leaves(da), jax.tree.leaves(db)):

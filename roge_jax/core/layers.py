@@ -124,14 +124,14 @@ def conv2d(p: Tree, x: jax.Array, *, stride: int = 1) -> jax.Array:
     """
     kernel = p["kernel"].astype(jnp.float32)
     plain = stride > 1 or jax.default_backend() != "cpu"
-    y = _conv2d(x, kernel, stride) if plain else _cpu_conv2d(x, kernel)
+    y = convolve(x, kernel, stride=stride) if plain else _cpu_conv2d(x, kernel)
     return y + lift(p["bias"].astype(jnp.float32), y.ndim)
 
 
-def _conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
-    numbers = ("NHWC", "HWIO", "NHWC")
+def convolve(x: jax.Array, kernel: jax.Array, *, stride: int = 1, padding="SAME") -> jax.Array:
+    """2-D convolution of images [n, h, w, c] with kernel [kh, kw, c, d]; padding as XLA takes it."""
     return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), "SAME", dimension_numbers=numbers
+        x, kernel, (stride, stride), padding, dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
 
 
@@ -139,11 +139,11 @@ def _conv2d(x: jax.Array, kernel: jax.Array, stride: int) -> jax.Array:
 # convolution with the mirrored kernel and a product of matrices they take 0.7 to 2.5 times as long as those outside.
 @jax.custom_vjp
 def _cpu_conv2d(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    return _conv2d(x, kernel, 1)
+    return convolve(x, kernel)
 
 
 def _cpu_conv2d_forward(x, kernel):
-    return _conv2d(x, kernel, 1), (x, kernel)
+    return convolve(x, kernel), (x, kernel)
 
 
 def _cpu_conv2d_backward(kept, dy):
@@ -154,7 +154,7 @@ def _cpu_conv2d_backward(kept, dy):
     taps = [around[:, i : i + h, j : j + w] for i in range(side) for j in range(side)]
     rows = jnp.concatenate(taps, -1).reshape(-1, kernel.shape[2] * side**2)
     d_kernel = (rows.T @ dy.reshape(-1, kernel.shape[3])).reshape(kernel.shape)
-    return _conv2d(dy, jnp.swapaxes(kernel[::-1, ::-1], 2, 3), 1), d_kernel
+    return convolve(dy, jnp.swapaxes(kernel[::-1, ::-1], 2, 3)), d_kernel
 
 
 _cpu_conv2d.defvjp(_cpu_conv2d_forward, _cpu_conv2d_backward)

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..config import VAEConfig
 from ..core.attention import attention
-from ..core.layers import lift, linear, linear_specs, norm_specs
+from ..core.layers import convolve, lift, linear, linear_specs, norm_specs
 from ..core.params import Spec, Tree, fan_in, zeros
 from ..errors import UserError
 
@@ -60,13 +60,6 @@ def _bias(p: Tree, y: jax.Array) -> jax.Array:
     return y + lift(p["bias"], y.ndim)
 
 
-def _conv(x: jax.Array, kernel: jax.Array, *, stride=1, padding=((1, 1), (1, 1))) -> jax.Array:
-    """2-D convolution of images [n, h, w, c] with kernel [kh, kw, c, d]."""
-    return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), padding, dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-
-
 def conv_specs(c_in: int, c_out: int, taps: tuple[int, ...]) -> Tree:
     """Kernel [*taps, c_in, c_out] and bias of a convolution."""
     kernel = Spec((*taps, c_in, c_out), (None,) * (len(taps) + 2), fan_in())
@@ -75,7 +68,7 @@ def conv_specs(c_in: int, c_out: int, taps: tuple[int, ...]) -> Tree:
 
 def causal_conv(p: Tree, x: jax.Array, past: jax.Array | None) -> tuple[jax.Array, jax.Array]:
     """Causal 3x3x3 convolution of x [t, h, w, c]; returns the output and the frames to remember."""
-    return _bias(p, _causal(_conv, p["kernel"], x, past)), _last(x, past)
+    return _bias(p, _causal(convolve, p["kernel"], x, past)), _last(x, past)
 
 
 def rms_norm(p: Tree, x: jax.Array) -> jax.Array:
@@ -148,7 +141,7 @@ def down_specs(c: int, temporal: bool) -> Tree:
 
 def down(p: Tree, x: jax.Array, past: Past) -> tuple[jax.Array, dict]:
     """Halve height and width (zeros on the right and below) and, if `p` has "time", the frames after the first."""
-    x = _bias(p["conv"], _conv(x, p["conv"]["kernel"], stride=2, padding=((0, 1), (0, 1))))
+    x = _bias(p["conv"], convolve(x, p["conv"]["kernel"], stride=2, padding=((0, 1), (0, 1))))
     if "time" not in p:
         return x, {}
     frames = x if past is None else jnp.concatenate([past["time"], x])
@@ -197,7 +190,7 @@ def up_conv(x: jax.Array, kernel: jax.Array) -> jax.Array:
         return jnp.concatenate([a + b, c] if phase else [a, b + c], axis)
 
     def part(i, j):
-        return _conv(x, fold(fold(kernel, 0, i), 1, j), padding=((1 - i, i), (1 - j, j)))
+        return convolve(x, fold(fold(kernel, 0, i), 1, j), padding=((1 - i, i), (1 - j, j)))
 
     t, h, w, _ = x.shape
     rows = [jnp.stack([part(i, 0), part(i, 1)], 3) for i in (0, 1)]
