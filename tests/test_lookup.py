@@ -140,6 +140,29 @@ def test_the_order_of_the_photos_does_not_matter():
         np.testing.assert_allclose(a, b, atol=2e-5)
 
 
+def test_repeated_photos_change_nothing():
+    """A photo agrees with its copy at every depth: counted twice it would drown what the others say."""
+    photos = RNG.random((3, H, W, 3)).astype(np.float32)
+    (K, c2w), of = cameras(3, seed=8), cameras(2, seed=9)
+    once = look(weights(0.1), photos, (K, c2w), of)
+    for more in ([0, 1, 2, 0, 1, 2], [0, 0, 0, 1, 2]):
+        again = look(weights(0.1), photos[more], (K[more], c2w[more]), of)
+        for a, b in zip(once, again):
+            np.testing.assert_allclose(a, b, atol=1e-3)
+    two = look(weights(0.1), photos[:2], (K[:2], c2w[:2]), of)
+    assert np.abs(once.rgb - two.rgb).max() > 0.05
+
+
+def test_photos_become_witnesses_of_their_own_as_they_part():
+    c2w = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
+    c2w[:, 0, 3] = 0.0, 0.5 * lookup.APART, 2.0
+    alike = lookup.twins(jnp.asarray(c2w))
+    np.testing.assert_allclose(alike, [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]], atol=1e-6)
+    seen = jnp.asarray([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # three cuts
+    found = lookup.witnesses(seen, alike)
+    np.testing.assert_allclose(found, [[2 / 3, 1, 0], [2 / 3, 0, 0], [1, 1, 1]], rtol=1e-6)
+
+
 def test_where_no_photo_sees_anything_the_rgb_head_stays():
     photos = RNG.random((2, H, W, 3)).astype(np.float32)
     seen_by, (K, c2w) = cameras(2, seed=8), cameras(1, seed=9)

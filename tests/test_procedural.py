@@ -181,6 +181,32 @@ def test_varied_lenses_are_those_of_the_pictures():
         assert (on_object | (wall < 1e-3) | (depth == SKY_DEPTH)).mean() > 0.99
 
 
+def test_handheld_cameras_turn_roll_and_look_from_above():
+    options = jax.jit(procedural.handheld_cameras, static_argnums=1)
+    scenes = [_scenes(np.int32(seed), _plain_textures()) for seed in range(40)]
+    path = jax.jit(lambda seed, scene, how: camera_path(seed, 6, scene=scene, **how)["c2w"])
+    rolled, down, orbit = [], [], []
+    for seed, scene in enumerate(scenes):
+        how = options(np.int32(seed), 6)
+        with_roll = np.asarray(path(np.int32(seed), scene, how), np.float64)
+        without = np.asarray(path(np.int32(seed), scene, how | {"roll": 0.0}), np.float64)
+        np.testing.assert_allclose(with_roll[:, :3, 2:], without[:, :3, 2:], atol=1e-6)
+        turn = np.swapaxes(without[:, :3, :3], 1, 2) @ with_roll[:, :3, :3]
+        angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
+        np.testing.assert_allclose(angle, how["roll"], atol=0.05)
+        rolled.append(np.abs(angle).max())
+        down.append(np.degrees(np.arcsin(-without[:, 2, 2])).max())
+        orbit.append(float(how["sweep"][0]))
+    assert 3 < np.sum(np.array(rolled) > 12) < 25 and max(rolled) <= 70
+    assert max(down) > 45  # most paths elsewhere stay below 30
+    low, high = procedural.HANDHELD_SWEEP
+    assert low <= min(orbit) < 60 and 250 < max(orbit) <= high + 1e-3
+    views = sample_sequence(3, **SMALL, varied=True, handheld=True)
+    scene = scenes[3]
+    want = camera_path(3, 5, scene=scene, **options(np.int32(3), 5))["c2w"]
+    np.testing.assert_allclose(views["c2w"], want, atol=1e-5)
+
+
 def test_principal_ray_and_pixel_centres():
     """Depth of a frontal floor seen from above is the camera height at every pixel (z-depth), and
     the pixel at column 0 looks along (0.5 - cx) / fx."""
@@ -407,7 +433,9 @@ def test_training_pools_are_varied_and_held_out_ones_are_not(monkeypatch, tmp_pa
     pool_module.main([*command, "0"])
     pool_module.main([*command, "0", "--no-varied"])
     pool_module.main([*command, str(HELDOUT_SEED)])
-    assert [options["varied"] for options in asked] == [True, False, False]
+    pool_module.main([*command, "0", "--handheld"])
+    assert [options["varied"] for options in asked] == [True, False, False, True]
+    assert [options["handheld"] for options in asked] == [False, False, False, True]
 
 
 @pytest.mark.parametrize(

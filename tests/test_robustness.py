@@ -74,6 +74,26 @@ def test_photo_disturbances_have_the_size_asked_for():
     assert focal[0, 0, 0] == pytest.approx(55) and focal[0, 0, 2] == 32
 
 
+def test_captured_photos_have_every_fault_within_its_dose():
+    cameras, images = looking_at_origin(200), np.full((200, 16, 16, 3), 0.5, np.float32)
+    baseline = np.linalg.norm(cameras.centres[:, None] - cameras.centres[None], axis=-1).max()
+    doses = []
+    for seed in range(40):
+        shot, found = perturb.captured(images, cameras, np.random.default_rng(seed))
+        relative = np.swapaxes(cameras.c2w[:, :3, :3], 1, 2) @ found.c2w[:, :3, :3]
+        turn = np.degrees(np.arccos(np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)))
+        gaps = np.linalg.norm(found.centres - cameras.centres, axis=1) / baseline
+        focal = np.log(found.K[:, 0, 0] / cameras.K[:, 0, 0])
+        assert np.ptp(focal) < 1e-9  # one lens
+        light = perturb.GAMMA * np.log2(shot.mean((1, 2, 3)) / 0.5)  # another exposure for each
+        noise = (shot - shot.mean((1, 2, 3), keepdims=True)).std()
+        rms = [np.sqrt(np.mean(x**2)) for x in (turn, gaps)]
+        doses.append([*rms, abs(focal[0]), np.abs(light).max(), noise])
+    largest = [perturb.TURN, perturb.MOVE, perturb.FOCAL, perturb.STOPS, perturb.NOISE]
+    share = np.array(doses) / largest
+    assert np.all(share.max(0) < 1.2) and np.all(share.max(0) > 0.8) and np.all(share.min(0) < 0.2)
+
+
 # Measures.
 
 

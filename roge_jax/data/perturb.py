@@ -1,4 +1,5 @@
-"""What goes wrong with posed photos, in measured doses: poses, focal lengths, noise, blur, JPEG, exposure.
+"""What goes wrong with posed photos, in measured doses: poses, focal lengths, noise, blur, JPEG, exposure; and a little of
+all that matters at once, as training draws it.
 
 Every function returns changed copies; random ones take a NumPy generator. Photos are float32 [m, h, w, 3] in [0, 1],
 doses are those that reach the model: a photo of 12 megapixels that is shrunk to 64 x 112 loses most of its own noise.
@@ -9,6 +10,8 @@ import numpy as np
 from roge_jax.geometry.cameras import Cameras, to_host
 
 GAMMA = 2.2  # of the photos, for what happens to light
+# Largest doses of `captured`: degrees, parts of the baseline, log focal length, stops, deviation of noise.
+TURN, MOVE, FOCAL, STOPS, NOISE = 0.6, 0.03, 0.02, 0.4, 0.03
 
 
 def turn_cameras(cameras: Cameras, degrees: float, rng: np.random.Generator) -> Cameras:
@@ -73,3 +76,16 @@ def expose(images: np.ndarray, stops: np.ndarray) -> np.ndarray:
     """Each photo with its light doubled `stops` [m] times (negative: halved), clipped to [0, 1]."""
     gain = (2.0 ** (np.asarray(stops, np.float64) / GAMMA)).astype(np.float32)
     return np.clip(images * gain[:, None, None, None], 0.0, 1.0)
+
+
+def captured(images: np.ndarray, cameras: Cameras, rng: np.random.Generator):
+    """Photos and their cameras as a capture would give them: every fault in a dose of its own, drawn from zero to the
+    largest. The same focal error for all photos (one lens), another exposure for each.
+    """
+    turn, move, focal, stops, noise = rng.random(5) * [TURN, MOVE, FOCAL, STOPS, NOISE]
+    centres = cameras.centres
+    baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
+    cameras = move_cameras(turn_cameras(cameras, turn, rng), move * baseline, rng)
+    cameras = scale_focal(cameras, float(np.exp(focal * rng.choice([-1.0, 1.0]))))
+    images = expose(images, stops * rng.uniform(-1.0, 1.0, len(images)))
+    return add_noise(images, noise, rng), cameras

@@ -68,6 +68,7 @@ def write_pool(
     scenes_per_shard: int = 100,
     depth: bool = False,
     varied: bool = False,
+    handheld: bool = False,
 ) -> None:
     """Render `sample_sequence` of every seed into a pool with one-thread worker processes.
 
@@ -90,7 +91,7 @@ def write_pool(
         )
     settings = {"frames": frames, "height": height, "width": width, "supersample": supersample}
     settings |= {"scenes_per_shard": scenes_per_shard, "depth": depth, "varied": varied}
-    settings |= {"first_seed": int(wanted[0])}
+    settings |= {"first_seed": int(wanted[0])} | ({"handheld": True} if handheld else {})
     path.mkdir(parents=True, exist_ok=True)
     with _sole_writer(path):
         _write_missing(path, wanted, settings, processes)
@@ -200,6 +201,7 @@ def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
             supersample=settings["supersample"],
             depth=depth,
             varied=settings["varied"],
+            handheld=settings.get("handheld", False),
         )
         for name, store in maps.items():
             store[row] = views[name]
@@ -259,7 +261,7 @@ def read_pool(path: str | Path) -> Pool:
 
 
 def _sheet(
-    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, varied: bool = False
+    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, **cameras: bool
 ) -> None:
     """A contact sheet: one row of views per scene."""
     from PIL import Image
@@ -270,7 +272,7 @@ def _sheet(
     rows = []
     for seed in seeds:
         scene = sample_sequence(
-            seed, frames=views, height=height, width=width, supersample=3, varied=varied
+            seed, frames=views, height=height, width=width, supersample=3, **cameras
         )
         rows.append(np.concatenate(list(scene["rgb"]), 1))
     half = (len(rows) + 1) // 2  # two scenes beside each other
@@ -328,6 +330,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sheet.add_argument("--scenes", type=number(1, 10**7), default=8)
     sheet.add_argument("--first-seed", type=number(), default=0)
     sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
+    for command in (pool, sheet):
+        command.add_argument(
+            "--handheld", action="store_true", help="photos from all around, from above, and rolled"
+        )
     bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
     for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
         command.add_argument("--frames", type=number(1), default=frames)
@@ -356,10 +362,11 @@ def _run(args: argparse.Namespace) -> None:
             scenes_per_shard=args.scenes_per_shard,
             depth=args.depth,
             varied=training if args.varied is None else args.varied,
+            handheld=args.handheld,
         )
     elif args.command == "sheet":
         seeds = range(args.first_seed, args.first_seed + args.scenes)
-        size = {"height": args.height, "width": args.width, "varied": args.varied}
-        _sheet(args.out, seeds, views=args.frames, **size)
+        options = {name: getattr(args, name) for name in ("height", "width", "varied", "handheld")}
+        _sheet(args.out, seeds, views=args.frames, **options)
     else:
         print(json.dumps(_bench(args.height, args.width, args.frames, args.supersample)))

@@ -11,6 +11,7 @@ training, the others for evaluation with textures never used in training.
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,7 @@ __all__ = [
     "SceneParams",
     "camera_path",
     "clear_views",
+    "handheld_cameras",
     "intrinsics",
     "load_textures",
     "make_scene",
@@ -53,8 +55,10 @@ __all__ = [
 HELDOUT_SEED = 1_000_000_000
 CLEARANCE = 0.35  # free space around every camera centre
 SWEEP = (20.0, 60.0)  # degrees of orbit over a whole path
+HEIGHTS, DISTANCES = (0.7, 1.9), (0.72, 1.0)  # of a path's middle, see `camera_path`
 VARIED_SWEEP = (12.0, 170.0)  # the same for training, log-uniform
 VARIED_FOV = (26.0, 86.0)  # degrees, log-uniform
+HANDHELD_SWEEP = (40.0, 360.0)  # degrees of orbit of handheld sequences, log-uniform
 _PATH_SAMPLES = 64  # where a path is checked for objects in the way
 
 
@@ -134,6 +138,9 @@ def camera_path(
     scene: SceneParams,
     sweep: tuple[float, float] = SWEEP,
     samples: Array | None = None,
+    heights: tuple[float, float] = HEIGHTS,
+    distances: tuple[float, float] = DISTANCES,
+    roll: Array | float = 0.0,
 ) -> dict[str, Array]:
     """A smooth path of n views around the scene's focus: `{"c2w": [n,4,4], "fov": []}`.
 
@@ -144,6 +151,9 @@ def camera_path(
 
     Args:
         samples: `[n]` positions along the path in [0, 1] instead of n equal steps.
+        heights: of the path's middle above the ground.
+        distances: of the cameras from the focus, in parts of the space there is.
+        roll: `[n]` degrees about the optical axes beside the few that every path has.
     """
     key = jnp.asarray(key_or_seed)
     if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
@@ -159,10 +169,10 @@ def camera_path(
     dolly = dice((), -1.0, 1.0) * jnp.array([0.2, 0.7, 0.5])[kind]
     azimuth = dice((), 0.0, 2 * jnp.pi) + orbit * s
     span = jnp.minimum(scene.camera_high[0], scene.camera_high[1])
-    radius = span * dice((), 0.72, 1.0) * jnp.exp(dolly * s)
+    radius = span * dice((), *distances) * jnp.exp(dolly * s)
     wobble = dice((3,), -1.0, 1.0)
     wave = jnp.sin(2 * jnp.pi * (wobble[0] + dice((), 0.4, 1.0) * s))
-    height = dice((), 0.7, 1.9) + 0.5 * wobble[1] * s + 0.08 * wobble[2] * wave
+    height = dice((), *heights) + 0.5 * wobble[1] * s + 0.08 * wobble[2] * wave
     ring = radius[:, None] * jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)], -1)
     position = jnp.concatenate([scene.focus[None, :2] + ring, height[:, None]], -1)
     position = _soft_clip(position, scene.camera_low, scene.camera_high)
@@ -170,14 +180,14 @@ def camera_path(
     aim = scene.focus + 0.3 * dice((3,), -1.0, 1.0) * jnp.array([1.0, 1.0, 0.6])
     drift = 0.4 * dice((3,), -1.0, 1.0) * jnp.array([1.0, 1.0, 0.3])
     aim = aim[None] + drift[None] * s[:, None]
-    roll = jnp.deg2rad(dice((2,), -2.0, 2.0))
-    roll = roll[0] + roll[1] * s
+    tilt = dice((2,), -2.0, 2.0)
+    tilt = jnp.deg2rad(tilt[0] + tilt[1] * s + roll)
     forward = aim - position
     forward = forward / jnp.linalg.norm(forward, axis=-1, keepdims=True)
     right = jnp.cross(forward, jnp.array([[0.0, 0.0, 1.0]]))
     right = right / jnp.linalg.norm(right, axis=-1, keepdims=True)
     down = jnp.cross(forward, right)
-    c, k = jnp.cos(roll)[:, None], jnp.sin(roll)[:, None]
+    c, k = jnp.cos(tilt)[:, None], jnp.sin(tilt)[:, None]
     axes = jnp.stack([c * right + k * down, c * down - k * right, forward, position], -1)
     last = jnp.broadcast_to(jnp.array([[[0.0, 0.0, 0.0, 1.0]]]), (n, 1, 4))
     return {
@@ -248,18 +258,38 @@ def varied_cameras(seed: Array, n: int, height: int, width: int) -> tuple[Array,
     return orbit, K.at[:, :2, 2].add(shift[None])
 
 
+def handheld_cameras(seed: Array, n: int) -> dict[str, Any]:
+    """Options of `camera_path` for photos taken by hand: few, from all around, also from above and close, and rolled.
+
+    Every view is rolled by up to 10 degrees of its own; along a third of the paths the camera turns by up to 120 more.
+    """
+    dice = Dice(jax.random.fold_in(jax.random.key(seed), 13), n + 16)
+    orbit = jnp.exp(dice((), *np.log(HANDHELD_SWEEP)))
+    turned = dice((), -120.0, 120.0) * (dice() < 1 / 3)
+    roll = dice((n,), -10.0, 10.0) + turned * jnp.linspace(-0.5, 0.5, n)
+    return {"sweep": (orbit, orbit), "heights": (0.7, 3.2), "distances": (0.3, 1.0), "roll": roll}
+
+
 @functools.partial(
     jax.jit,
-    static_argnames=("frames", "height", "width", "supersample", "sweep", "depth", "varied"),
+    static_argnames=(
+        *("frames", "height", "width", "supersample", "sweep"),
+        *("depth", "varied", "handheld"),
+    ),
 )
-def _sequence(seed, textures, *, frames, height, width, supersample, sweep, depth, varied):
+def _sequence(
+    seed, textures, *, frames, height, width, supersample, sweep, depth, varied, handheld
+):
+    options = {"sweep": sweep}
     if varied:
         orbit, K = varied_cameras(seed, frames, height, width)
-        sweep = (orbit, orbit)
+        options = {"sweep": (orbit, orbit)}
+    if handheld:
+        options = handheld_cameras(seed, frames)
     scene = make_scene(seed, textures=textures)
-    dense = camera_path(seed, _PATH_SAMPLES, scene=scene, sweep=sweep)
+    path = camera_path(seed, frames, scene=scene, **options)
+    dense = camera_path(seed, _PATH_SAMPLES, scene=scene, **options | {"roll": 0.0})
     scene = clear_views(scene, dense["c2w"])
-    path = camera_path(seed, frames, scene=scene, sweep=sweep)
     if not varied:
         K = jnp.repeat(intrinsics(path["fov"], height, width)[None], frames, 0)
 
@@ -282,6 +312,7 @@ def sample_sequence(
     sweep: tuple[float, float] = SWEEP,
     depth: bool = True,
     varied: bool = False,
+    handheld: bool = False,
 ) -> dict[str, np.ndarray]:
     """The views of one scene along one smooth path.
 
@@ -289,6 +320,7 @@ def sample_sequence(
         sweep: degrees of orbit over the path, drawn uniformly.
         varied: the training distribution: orbits and lenses of `varied_cameras` in place of `sweep` and one
             centred lens of 45 to 75 degrees.
+        handheld: the cameras of `handheld_cameras` in place of `sweep`; with `varied` its lenses.
 
     Returns:
         `rgb` uint8 `[f,h,w,3]`, `depth` float32 `[f,h,w]` (z-depth; sky `SKY_DEPTH`; absent with
@@ -308,6 +340,7 @@ def sample_sequence(
         sweep=tuple(map(float, sweep)),
         depth=depth,
         varied=varied,
+        handheld=handheld,
     )
     out = {
         "rgb": np.asarray(rgb),

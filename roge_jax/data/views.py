@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..geometry.cameras import Cameras, camera_vector, normalise
+from .perturb import captured
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,9 @@ class ViewConfig:
     outside: float = 0.2  # probability that contexts surround the window instead of lying in it
     near: float = 0.4  # probability of drawing all views from a short stretch of the path
     augment: bool = True
+    faults: float = (
+        0.0  # probability that the photos have the faults of a capture (`perturb.captured`)
+    )
     size: tuple[int, int] | None = None  # height, width; None: as stored
 
 
@@ -129,6 +133,10 @@ def draw_batch(
         c2w = np.asarray(sequence["c2w"][views], np.float64)
         if cfg.augment:
             rgb, K, c2w = alter(rng, rgb, K, c2w)
+        if cfg.faults and rng.random() < cfg.faults:
+            photos, cameras = captured(rgb[:m].astype(np.float32), Cameras(K[:m], c2w[:m]), rng)
+            rgb, K = np.concatenate([photos, rgb[m:]]), np.concatenate([cameras.K, K[m:]])
+            c2w = np.concatenate([cameras.c2w, c2w[m:]])
         try:
             samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))
         except UserError as error:

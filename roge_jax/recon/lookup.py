@@ -37,6 +37,7 @@ FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
 ALONG = 5  # neighbouring cuts that a coarse block sees
 UNSEEN = -8.0  # logit of cuts that no photo sees
 BEHIND = 1e-3  # depths in a photo below this are behind it
+APART = 0.05  # distance in the normalised scene from which photos are witnesses of their own
 EPS = 1e-5
 
 
@@ -131,16 +132,37 @@ def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array)
     return upper + fy * (lower - upper), seen.astype(jnp.float32)
 
 
-def agreement(values: jax.Array, seen: jax.Array):
-    """Mean and standard deviation over the photos that see a cut, and their number: values [m, .., c], seen [m, ..].
+def twins(photo_c2w: jax.Array) -> jax.Array:
+    """How much two photos were taken from one place [m, m]: 1 there, 0 from `APART` on.
+
+    Photos from one place agree at every depth, so that together they are worth one (`witnesses`).
+    """
+    centres = jax.lax.stop_gradient(photo_c2w[:, :3, 3])
+    apart = jnp.sqrt(jnp.square(centres[:, None] - centres[None]).sum(-1))
+    return jnp.clip(1.0 - apart / APART, 0.0, 1.0)
+
+
+def witnesses(seen: jax.Array, alike: jax.Array) -> jax.Array:
+    """`seen` [m, ..] between 0 and 1, shared among those that see the same from the same place (`twins`)."""
+    return jnp.square(seen) / jnp.maximum(jnp.tensordot(alike, seen, 1), EPS)
+
+
+def agreement(values: jax.Array, weight: jax.Array):
+    """Mean and standard deviation over the photos that see a cut, and their number: values [m, .., c], weight [m, ..]
+    as by `witnesses`.
 
     Fewer than two photos agree on nothing: their deviation is that of strangers.
     """
-    n = seen.sum(0)[..., None]
-    share = seen[..., None] / jnp.maximum(n, 1.0)[None]
+    n = weight.sum(0)[..., None]
+    share = weight[..., None] / jnp.maximum(n, EPS)[None]
     mean = (values * share).sum(0)
     variance = (jnp.square(values - mean[None]) * share).sum(0) * n / jnp.maximum(n - 1.0, 1.0)
-    return mean, jnp.sqrt(jnp.where(n >= 2, variance, 0.1) + 1e-4), n
+    return mean, jnp.sqrt(jnp.where(n > 1.5, variance, 0.1) + 1e-4), n
+
+
+def _counts(n: jax.Array) -> list[jax.Array]:
+    """Whether a photo sees it, and whether two from different places do."""
+    return [(n > 0.5).astype(jnp.float32), (n > 1.5).astype(jnp.float32)]
 
 
 def _pixels(h: int, w: int, step: int) -> jax.Array:
@@ -182,7 +204,8 @@ def look_up(
     shrink = jnp.asarray([1 / CELL, 1 / CELL, 1.0])
     shrunk = Motion(shrink[None, None, :, None] * way.turn, shrink[None, None] * way.shift)
     low = _cells(head)
-    coarse = jax.vmap(jax.checkpoint(lambda *a: _coarse(p, maps, *a)))
+    alike = twins(photo_cameras[1])
+    coarse = jax.vmap(jax.checkpoint(lambda *a: _coarse(p, maps, alike, *a)))
     colours, cut, sure, hidden = coarse(shrunk, prior, context, low)
 
     weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
@@ -194,10 +217,10 @@ def look_up(
         x = (weights * nine[..., None, :]).sum(-1)
         return unpatchify(x.reshape(v, ch * cw, CELL**2), size, CELL)[..., 0]
 
-    fine = jax.vmap(jax.checkpoint(lambda *a: _fine(p["fine"], photos, cuts, *a)))
+    fine = jax.vmap(jax.checkpoint(lambda *a: _fine(p["fine"], photos, alike, cuts, *a)))
     found, seen, cut = fine(way, upsampled(cut), head)
     far = _distance(cameras[1], photo_cameras[1], inverse_depth(cut, cuts))
-    looked, some, scene = _chosen(p["choose"], found, seen, far, head)
+    looked, some, scene = _chosen(p["choose"], found, seen, alike, far, head)
     rgb = _merged(
         p["merge"], head, looked, some, jnp.concatenate([scene, upsampled(sure)[..., None]], -1)
     )
@@ -211,7 +234,7 @@ def _features(p: Tree, photos: jax.Array) -> jax.Array:
     return conv2d(p["conv3"], y)
 
 
-def _coarse(p: Tree, maps, way: Motion, prior, context, head):
+def _coarse(p: Tree, maps, alike, way: Motion, prior, context, head):
     """One view's distribution over the cuts of a cell, from prior [ch, cw, k] and context [ch, cw, c].
 
     Returns the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there [ch, cw], and the hidden
@@ -221,14 +244,14 @@ def _coarse(p: Tree, maps, way: Motion, prior, context, head):
     numbers = jnp.arange(cuts, dtype=jnp.float32)
     inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, ch * cw))
     values, seen = fetch(maps, way, _pixels(ch, cw, CELL), inverse)
-    mean, deviation, n = (x.reshape(cuts, ch, cw, -1) for x in agreement(values, seen))
+    agreed = agreement(values, witnesses(seen, alike))
+    mean, deviation, n = (x.reshape(cuts, ch, cw, -1) for x in agreed)
     prior = jnp.moveaxis(prior, -1, 0)
     colour = mean[..., MATCHED:]
     evidence = [
         deviation[..., :MATCHED],
         jnp.abs(colour - head[None]),
-        (n >= 1).astype(jnp.float32),
-        (n >= 2).astype(jnp.float32),
+        *_counts(n),
         prior[..., None],
         jnp.broadcast_to(context[None], (cuts, *context.shape)),
     ]
@@ -240,7 +263,7 @@ def _coarse(p: Tree, maps, way: Motion, prior, context, head):
         near = jnp.concatenate([near[j : j + cuts] for j in range(ALONG)], -1)
         along = block["along"] | {"kernel": block["along"]["kernel"].reshape(-1, WIDTH)}
         y = y + linear(along, near)
-    logits = linear(p["score"], jax.nn.relu(y))[..., 0] + prior + UNSEEN * (n[..., 0] < 1)
+    logits = linear(p["score"], jax.nn.relu(y))[..., 0] + prior + UNSEEN * (n[..., 0] < 0.5)
     share = jax.nn.softmax(logits, 0)
     colours = (share[..., None] * jnp.where(n > 0, colour, head[None])).sum(0)
     # The mean over all cuts lies between two surfaces and on neither: only the peak and its neighbours count.
@@ -251,7 +274,7 @@ def _coarse(p: Tree, maps, way: Motion, prior, context, head):
     return colours, cut, mass, (share[..., None] * y).sum(0)
 
 
-def _fine(p: Tree, photos, cuts: int, way: Motion, cut, head):
+def _fine(p: Tree, photos, alike, cuts: int, way: Motion, cut, head):
     """One view's colours in every photo [m, h, w, 3] about the cut [h, w], how much of them is seen [m, h, w, 1], and the
     cut itself, refined.
     """
@@ -259,13 +282,13 @@ def _fine(p: Tree, photos, cuts: int, way: Motion, cut, head):
     offsets = jnp.asarray((np.arange(FINE) - (FINE - 1) / 2) / 4, jnp.float32)
     inverse = inverse_depth(offsets[:, None] + cut.reshape(1, -1), cuts)
     values, seen = fetch(photos, way, _pixels(h, w, 1), inverse)
-    mean, deviation, n = (x.reshape(FINE, h, w, -1) for x in agreement(values, seen))
-    counts = [(n >= 1).astype(jnp.float32), (n >= 2).astype(jnp.float32)]
-    y = jnp.concatenate([deviation, jnp.abs(mean - head[None]), *counts], -1)
+    agreed = agreement(values, witnesses(seen, alike))
+    mean, deviation, n = (x.reshape(FINE, h, w, -1) for x in agreed)
+    y = jnp.concatenate([deviation, jnp.abs(mean - head[None]), *_counts(n)], -1)
     y = jnp.moveaxis(y, 0, 2).reshape(1, h, w, -1)
     y = jax.nn.relu(conv2d(p["conv1"], y))
     y = y + jax.nn.relu(conv2d(p["conv2"], y))
-    logits = jnp.moveaxis(conv2d(p["conv3"], y)[0], -1, 0) + UNSEEN * (n[..., 0] < 1)
+    logits = jnp.moveaxis(conv2d(p["conv3"], y)[0], -1, 0) + UNSEEN * (n[..., 0] < 0.5)
     share = jax.nn.softmax(logits, 0)
     refined = cut + (share * offsets[:, None, None]).sum(0)
     share = share.reshape(1, FINE, h * w, 1)
@@ -287,14 +310,17 @@ def _distance(c2w, photo_c2w, inverse) -> jax.Array:
     return (apart[:, :, None, None] * inverse[:, None] + chord[:, :, None, None])[..., None]
 
 
-def _chosen(p: Tree, found, seen, far, head):
+def _chosen(p: Tree, found, seen, alike, far, head):
     """The photos' colours [v, m, h, w, 3] weighed: (colour [v, h, w, 3], how much of it is seen [v, h, w, 1], two numbers
     per pixel about the choice [v, h, w, 2]).
 
     The choice starts from 1 / distance^2 among photos that see the cut.
     """
     v, m, h, w, _ = found.shape
-    mean = (found * seen).sum(1, keepdims=True) / jnp.maximum(seen.sum(1, keepdims=True), 1.0)
+    shared = jax.vmap(witnesses, (0, None))
+    weight = shared(seen, alike)
+    total = weight.sum(1, keepdims=True)
+    mean = (found * weight).sum(1, keepdims=True) / jnp.maximum(total, EPS)
     nearest = far.min(1, keepdims=True)
     odd = jnp.abs(found - mean).mean(-1, keepdims=True)
     ratio = nearest / (far + 1e-3)
@@ -302,7 +328,7 @@ def _chosen(p: Tree, found, seen, far, head):
     y = jnp.concatenate(known, -1).reshape(v * m, h, w, -1)
     y = conv2d(p["conv2"], jax.nn.relu(conv2d(p["conv1"], y))).reshape(v, m, h, w, 1)
     near = -2.0 * jnp.log(far / (nearest + 1e-3) + 1e-2)
-    share = jax.nn.softmax(y + jnp.log(seen + 1e-4) + near, 1)
+    share = jax.nn.softmax(y + jnp.log(shared(seen + 1e-4, alike)) + near, 1)
     looked = (share * found).sum(1)
     spread = (share * jnp.square(found - looked[:, None])).sum(1).mean(-1, keepdims=True)
     about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(1)], -1)

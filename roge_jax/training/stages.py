@@ -134,7 +134,7 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
-    few = ViewConfig(targets=4, near=0.3)
+    few = ViewConfig(targets=4, near=0.3, faults=0.3)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
@@ -354,7 +354,13 @@ def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: 
         for i in range(scenes)
     ]
     views = dataclasses.replace(
-        stage.views, contexts=(3,), context_weights=(1.0,), augment=False, near=0.0, size=None
+        stage.views,
+        contexts=(3,),
+        context_weights=(1.0,),
+        augment=False,
+        near=0.0,
+        faults=0.0,
+        size=None,
     )
     fixed = dataclasses.replace(stage, views=views, batch=4)
     batches = [stage_batch(pool, fixed, config, 0, i) for i in range(scenes // 4)]
