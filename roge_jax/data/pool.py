@@ -261,7 +261,7 @@ def read_pool(path: str | Path) -> Pool:
 
 
 def _sheet(
-    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, **cameras: bool
+    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, **cameras: Any
 ) -> None:
     """A contact sheet: one row of views per scene."""
     from PIL import Image
