@@ -180,7 +180,7 @@ class Engine:
         cond = condition(self.params, known, features, views, shown=shown)
         lost = self.program(preview.lost_detail, self.config)(self.params, shown, cond)
         prepared = model.Prepared(known, features, shown, cond, None, lost)
-        noise = sampling.draw_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
+        noise = sampling.window_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
         settings = dataclasses.replace(
             self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
         )

@@ -132,9 +132,9 @@ def parts(trial: Trial):
         trainable = attach(trainable, init_specs(jax.random.key(SEED + 1), added))
         specs = attach(specs, added)
     if trial.frozen != jnp.float32:
-        from roge_jax.train import reduced
+        from roge_jax.train import in_precision
 
-        frozen = reduced(frozen, "bfloat16")
+        frozen = in_precision(frozen, "bfloat16")
     trainable = jax.tree.map(lambda x: x.astype(trial.trained), trainable)
     return trainable, frozen, specs
 

@@ -29,12 +29,12 @@ from roge_jax.geometry.cameras import (
     invert,
     normalise,
     opencv_to_opengl,
-    straightness,
     to_opencv,
 )
 from roge_jax.geometry.crops import cover_window
 from roge_jax.geometry.trajectories import focus_distance
 from roge_jax.geometry.validation import Finding, axes_votes
+from roge_jax.metrics.geometry import straightness
 
 BAD_FIT = (
     3.0  # pixels of median epipolar distance: good poses reach 0.1 to 1, wrong axes 20 and more
@@ -124,7 +124,7 @@ def _numbers(scene: Scene, cameras: Cameras, config: Config) -> dict[str, Any]:
         "focus_distance": focus_distance(cameras),
         "status": info.status,
         "divisor": info.divisor,
-        "straightness": straightness(cameras) if len(cameras) > 1 else float("nan"),
+        "straightness": straightness(cameras.centres),
         "axes_meet_in_front": front,
         "axes_meet_behind": behind,
         "offset": float(np.abs(cameras.centres).max()),
@@ -151,8 +151,8 @@ def _about_poses(scene: Scene, cameras: Cameras) -> list[Finding]:
         what = f"positions up to {offset:.3g} in a scene of size {info.context_reach:.3g}"
         fix = "fine here (float64 until re-centred), but other programs will lose precision"
         findings.append(Finding("note", "cameras", what, fix))
-    flat = straightness(cameras) if len(cameras) > 2 else float("nan")
-    if flat < 1e-2:
+    flat = straightness(cameras.centres)
+    if len(cameras) > 2 and info.context_reach > 0 and flat < 1e-2:
         what = f"camera positions lie on a line (straightness {flat:.1e})"
         fix = "fine for rays; rotation errors after alignment mean nothing, use relative ones"
         findings.append(Finding("note", "cameras", what, fix))

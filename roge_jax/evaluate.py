@@ -161,7 +161,7 @@ class Evaluator:
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
-        self.noise = functools.partial(sampling.draw_noise, seed, 0, config=config)
+        self.noise = functools.partial(sampling.window_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
 
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:

@@ -180,7 +180,7 @@ def reduced(
     return photos, config, settings
 
 
-def draw_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
+def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
     """The noise of a window [t, lh, lw, 16] from seed and number alone, the same on every device.
 
     NumPy, because compiling JAX's generator takes longer than a short video's sampling.
@@ -283,7 +283,7 @@ def sample(
         with stage("prepare"):
             prepared = jax.block_until_ready(run.prepare(params, views))
             noise = jax.device_put(
-                draw_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :],
+                window_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :],
                 sharding.everywhere(),
             )
         with stage("sample"):

@@ -271,7 +271,7 @@ def on_host():
     return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
 
 
-def reduced(frozen, dtype: str):
+def in_precision(frozen, dtype: str):
     """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
     from .core.params import flatten, unflatten
     from .cost import keeps_float32
@@ -346,7 +346,7 @@ def run_stage(args, stage, params, cfg, mesh=None):
     frozen = stages.read(frozen, stage)
     dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
     if dtype != "float32":
-        frozen = reduced(frozen, dtype)
+        frozen = in_precision(frozen, dtype)
     if mesh is not None:  # now, so that no device ever holds all of it twice
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     say = print if distributed.is_main() else (lambda *_: None)

@@ -211,15 +211,6 @@ def test_offsets_of_map_coordinates(seed, offset):
     assert_same_inputs(*inputs, tolerance=1e-5)
 
 
-def test_straightness():
-    rng = np.random.default_rng(0)
-    assert cams.straightness(random_cameras(rng, 8, straight=True)) < 1e-12
-    assert cams.straightness(random_cameras(rng, 50)) > 0.5
-    still = random_cameras(rng, 3)
-    still.c2w[:, :3, 3] = 2.0
-    assert np.isnan(cams.straightness(still))
-
-
 def test_subsets():
     every = random_cameras(np.random.default_rng(0), 5)
     assert len(every[2]) == 1 and len(every[1:]) == 4 and len(every[[0, 3]]) == 2

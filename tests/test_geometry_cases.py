@@ -29,7 +29,6 @@ from roge_jax.geometry.cameras import (
     inspect,
     normalise,
     opencv_to_opengl,
-    straightness,
     to_opencv,
     validate,
 )
@@ -37,6 +36,7 @@ from roge_jax.geometry.crops import crop_resize, crop_resize_K
 from roge_jax.geometry.packing import pack_views
 from roge_jax.geometry.rays import plucker, project, ray_distance, triangulate
 from roge_jax.geometry.validation import nearest_rotation
+from roge_jax.metrics.geometry import straightness
 
 few = settings(max_examples=25, deadline=None)
 
@@ -100,7 +100,7 @@ def test_duplicate_views():
 def test_collinear_centres():
     """Fine for rays; the number that flags it is small."""
     line = random_cameras(np.random.default_rng(0), 6, straight=True)
-    assert straightness(line) < 1e-2 < straightness(some(6))
+    assert straightness(line.centres) < 1e-2 < straightness(some(6).centres)
     _, rays, status = network_inputs(line[:3], line[3:])
     assert np.isfinite(rays).all() and status == "ok"
 

@@ -313,7 +313,7 @@ def test_one_photo_can_be_planned_for(make, photos):
 
 
 def test_targets_keep_their_noise_when_photos_are_dropped():
-    full = sampling.draw_noise(3, 0, 4, CONFIG)
+    full = sampling.window_noise(3, 0, 4, CONFIG)
     fewer = full[-CONFIG.slots(2) :]
     np.testing.assert_array_equal(fewer[2:], full[4:])
 

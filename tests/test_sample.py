@@ -206,7 +206,7 @@ def test_program_agrees_with_the_model_file(weights, photos):
     ours = sampling.sample(weights, CONFIG, photos, path, SETTINGS)
     context, target, info = normalise(photos.cameras, path)
     views = sampling.window_views(photos.images, None, context, target, info, CONFIG)
-    noise = sampling.draw_noise(0, 0, 4, CONFIG)
+    noise = sampling.window_noise(0, 0, 4, CONFIG)
     grid = sampling.flow.schedule(SETTINGS.of(CONFIG).schedule, 2)
 
     @jax.jit
@@ -301,7 +301,7 @@ class TestChaining:
 
 def test_noise_depends_on_seed_and_window_alone():
     draw = [
-        sampling.draw_noise(seed, window, 2, CONFIG)
+        sampling.window_noise(seed, window, 2, CONFIG)
         for seed, window in ((0, 0), (0, 1), (1, 0), (0, 0))
     ]
     assert draw[0].dtype == np.float32 and draw[0].shape == (4, 4, 6, 16)

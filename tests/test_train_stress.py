@@ -67,7 +67,7 @@ def prepared(stage):
     goal = functools.partial(stages.OBJECTIVES[stage.objective], config=CONFIG, stage=stage)
     made = jax.jit(loop.make_step(goal, optimiser, OPTIM))
     state = loop.initial_state(trainable, optimiser, OPTIM)
-    return made, state, train.reduced(frozen, "bfloat16")
+    return made, state, train.in_precision(frozen, "bfloat16")
 
 
 def taken(stage, batch):

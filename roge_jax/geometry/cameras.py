@@ -42,7 +42,6 @@ __all__ = [
     "rotation",
     "scale_K",
     "shift_K",
-    "straightness",
     "to_host",
     "to_opencv",
     "turn",
@@ -352,19 +351,6 @@ def normalise(
         notes=tuple(notes),
     )
     return Cameras(context.K, c2w[0]), Cameras(target.K, c2w[1]), info
-
-
-def straightness(cameras: Cameras) -> float:
-    """Second over first singular value of the centred positions: 0 on a line, 1 for a disc.
-
-    Below 1e-2 a similarity alignment of the trajectory leaves the rotation about the line
-    undetermined. NaN if all centres coincide.
-    """
-    centres = to_host(cameras).centres
-    values = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-    if len(centres) < 2 or values[0] <= 1e-13 * np.abs(centres).max():
-        return float("nan")
-    return float(values[1] / values[0])
 
 
 def inspect(

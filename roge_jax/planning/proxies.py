@@ -151,7 +151,7 @@ def richardson(
     )
     views = window_views(photos.images, None, context, target[: config.frames], info, config)
     m = len(photos.ids)
-    noise = jnp.asarray(sampling.draw_noise(settings.seed, 0, m, config))
+    noise = jnp.asarray(sampling.window_noise(settings.seed, 0, m, config))
     key = ("richardson", m, small, settings.slots)
     if key not in compiled:
         compiled[key] = jax.jit(functools.partial(_two_runs, config=small, slots=settings.slots))
