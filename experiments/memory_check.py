@@ -33,12 +33,12 @@ def check(name: str, remat: str) -> dict:
     import jax
 
     from roge_jax import config
-    from roge_jax.training import plan, stages
+    from roge_jax.training import estimate, stages
 
     cfg = config.preset(name)
     stage = dataclasses.replace(stages.lora_stage(10, frames=cfg.frames), remat=remat)
-    found = plan.plan(cfg, stage, m=M)
-    step, arguments = plan.abstract_step(cfg, stage, M, scenes=1)
+    found = estimate.estimate(cfg, stage, m=M)
+    step, arguments = estimate.abstract_step(cfg, stage, M, scenes=1)
     # Weights that a step does not read (the VAE's decoder) still lie on the device.
     lowered = jax.jit(step, donate_argnums=0, keep_unused=True).lower(*arguments)
     used = lowered.compile().memory_analysis()
@@ -84,7 +84,7 @@ def main() -> None:
             f"{ratio['all']:.2f} | {ratio['temporary']:.2f} |",
             flush=True,
         )
-        RESULT.write_text(json.dumps({"environment": environment(), "rows": rows}, indent=1) + "\n")
+    RESULT.write_text(json.dumps({"environment": environment(), "rows": rows}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

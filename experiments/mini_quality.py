@@ -7,11 +7,12 @@ Writes results/mini_quality.json, mini_quality.png (samplers), mini_knobs.png (p
 tables between the markers in docs/solvers.md. All points of a run share scenes (held-out split), photos and noise.
 Reference: classical Runge-Kutta, 64 graded steps; its self-error is the distance to 32 steps. Budgets are evaluations of
 the velocity network; a method takes as many steps as fit. Times: wall time of sampling alone, all scenes in one
-batch, divided by their number, one run each after compilation. Intervals: bootstrap over scenes, 95 %.
+batch, divided by their number; median, fastest and slowest of three runs after one that is not counted, for every
+method alike. Intervals: bootstrap over scenes, 95 %.
 
 PSNR to the truth alone cannot judge a sampler: the mean of all plausible videos, which one evaluation gives, is
-blurred and has the *higher* PSNR. Goals are therefore two-sided (|difference| to Euler with 50 steps) and stand beside sharpness
-and the distance to the reference's own frames. Schedules: run optimise_schedules.py first after any training.
+blurred and has the *higher* PSNR. Goals are therefore two-sided and include sharpness (`reaches`), and stand beside
+the distance to the reference's own frames. Schedules: run optimise_schedules.py first after any training.
 The published system reports no such chart. Our numbers: docs/solvers.md. Time on 4 CPU cores: in the JSON.
 """
 
@@ -36,6 +37,7 @@ from quality.scenes import (
     fingerprint,
     most_steps,
     render,
+    timed,
 )
 
 from roge_jax.checkpoint import load_model
@@ -79,7 +81,7 @@ def sweep(sampler: Sampler, judge: Judge, args) -> tuple[list[dict], dict[str, A
         frames = judge.frames(run.latents)
         return judge.scores(frames) | judge.against(run.latents, frames, full, base["frames"])
 
-    euler = sampler.run("euler", sampler.grid("uniform", 50, "euler"))
+    euler = sampler.timed("euler", sampler.grid("uniform", 50, "euler"))
     base["euler50"], base["euler50_run"] = measured(euler), euler
     records = []
 
@@ -98,43 +100,57 @@ def sweep(sampler: Sampler, judge: Judge, args) -> tuple[list[dict], dict[str, A
         )
 
     for solver, schedule, steps in points(config, args.solvers, args.budgets):
-        add(solver, schedule, steps, sampler.run(solver, sampler.grid(schedule, steps, solver)))
+        add(solver, schedule, steps, sampler.timed(solver, sampler.grid(schedule, steps, solver)))
         print(solver, schedule, steps, f"{records[-1]['metrics']['latent_error']['mean']:.4f}", flush=True)  # fmt: skip
     for tolerance in TOLERANCES:
         add("bosh3", "adaptive", tolerance, sampler.adaptive(tolerance))
     return records, base
 
 
+def reaches(record: dict, limit: float, sharpness: float) -> bool:
+    """Euler 50's quality: PSNR to the truth within `limit` dB of its own either way (mean over scenes, same photos and
+    noise), and the sharpness ratio within SAME_SHARPNESS of its `sharpness`: a blurred video may have any PSNR.
+    """
+    ratio = record["metrics"]["sharpness_ratio"]["mean"] / sharpness
+    return abs(record["psnr_to_euler50"]["mean"]) <= limit and abs(ratio - 1.0) <= SAME_SHARPNESS
+
+
 def verdict(
     records: list[dict], euler50: dict[str, dict[str, float]], own: FlowConfig
 ) -> dict[str, Any]:
-    """Which goals are met, by the point closest to the reference within the evaluations; the default and its rival."""
+    """Which goals are met, the cheapest point with Euler 50's quality, and the default.
+
+    A goal is met if any sampler within its evaluations `reaches` Euler 50. Named is the one of them that is closest to the
+    reference; if there is none, the one with the nearest PSNR. As the best of many on the same scenes it is an
+    optimistic choice: the JSON and the page count those that passed, and those that did with their whole interval.
+    """
     name = lambda r: f"{r['solver']} {r['schedule']} {r['steps']}"  # noqa: E731
+    error = lambda r: r["metrics"]["latent_error"]["mean"]  # noqa: E731
+    sharp = euler50["sharpness_ratio"]["mean"]
     found: dict[str, Any] = {"goals": []}
     for evaluations, limit in GOALS:
         fit = [r for r in records if r["evaluations"] <= evaluations]
-        best = min(fit, key=lambda r: r["metrics"]["latent_error"]["mean"])
-        gap = best["psnr_to_euler50"]
+        passing = [r for r in fit if reaches(r, limit, sharp)]
+        sure = [r for r in passing if max(map(abs, r["psnr_to_euler50"].values())) <= limit]
+        nearest = lambda r: abs(r["psnr_to_euler50"]["mean"])  # noqa: E731
+        best = min(passing, key=error) if passing else min(fit or records, key=nearest)
         found["goals"].append(
             {
                 "evaluations": evaluations,
                 "limit_db": limit,
+                "reached": bool(passing),
+                "samplers": len(fit),
+                "passing": len(passing),
+                "passing_by_interval": len(sure),
                 "point": name(best),
-                "psnr_to_euler50": gap,
-                "reached": abs(gap["mean"]) <= limit,
-                "reached_by_interval": max(abs(gap["low"]), abs(gap["high"])) <= limit,
+                "psnr_to_euler50": best["psnr_to_euler50"],
             }
         )
-    sharp = euler50["sharpness_ratio"]["mean"]
-    close = [
-        r
-        for r in records
-        if abs(r["psnr_to_euler50"]["mean"]) <= GOALS[0][1]
-        and abs(r["metrics"]["sharpness_ratio"]["mean"] / sharp - 1.0) <= SAME_SHARPNESS
-    ]
+    close = [r for r in records if reaches(r, GOALS[0][1], sharp)]
     if close:  # the fewest evaluations among those; then the smallest error
-        best = min(close, key=lambda r: (r["evaluations"], r["metrics"]["latent_error"]["mean"]))
-        found["fewest_evaluations_within_goal"] = name(best)
+        found["fewest_evaluations_within_goal"] = name(
+            min(close, key=lambda r: (r["evaluations"], error(r)))
+        )
     found["default"] = f"{own.solver} {own.schedule} {own.steps}"
     return found
 
@@ -147,11 +163,7 @@ def main(args: argparse.Namespace) -> None:
     sequences = render(seeds, config)
     scenes = assemble(params, sequences, config)
     sampler, judge = Sampler(params, scenes, config), Judge(params, config, scenes)
-    sampler.velocity(scenes.noise, 1.0).block_until_ready()  # compiles
-    judge.frames(scenes.noise[:, scenes.m :])
-    clock = time.perf_counter()
-    judge.frames(scenes.noise[:, scenes.m :])
-    decode_seconds = (time.perf_counter() - clock) / args.scenes
+    _, decode_seconds = timed(lambda: judge.frames(scenes.noise[:, scenes.m :]), args.scenes)
     records, base = sweep(sampler, judge, args)
     euler50 = summary(base["euler50"])
 
@@ -168,7 +180,7 @@ def main(args: argparse.Namespace) -> None:
     others += knobs.over_steps(peer, config, scenes)
     others += knobs.over_sizes(params, config, seeds)
     others += knobs.in_bfloat16(params, config, scenes, exact)
-    others += knobs.with_block_cache(params, config, scenes, judge, exact)
+    others += knobs.with_block_cache(sampler, judge, exact)
     others += knobs.refinement()
     others.append(knobs.record("ceiling", "truth", "truth itself", judge.scores(scenes.truth)))
     others.append(knobs.round_trip(params, config, scenes, judge))

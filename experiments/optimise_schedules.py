@@ -2,7 +2,7 @@
 
     python experiments/optimise_schedules.py [--checkpoint mini] [--solvers ab2 euler ...] [--scenes 4]
 
-Repeat it after any training of the velocity network: the grids belong to the weights they were found on. Writes the
+Repeat it after any training, of the reconstruction too: the grids belong to the weights they were found on, all of them. Writes the
 entry of the model in roge_jax/video/schedules.json (grids and where they come from; read by
 `flow.schedule("optimised", ...)`) and results/optimise_schedules.json (errors on scenes that the search did not see).
 Teacher: midpoint, 48 steps, graded towards 0, on training-split scenes with 3 photos. A first grid by dynamic programming

@@ -12,16 +12,21 @@ even seeds have their photos evenly spread, odd ones in two bursts of three, as 
 Calibration uses training seeds (rung by rung in turn), the ladder held-out seeds with textures never trained on.
 
 For every tolerance and scene the planner (`roge_jax.planning`) makes a plan; its FLOPs include those of planning.
-Beside it, at the planner's cost or the nearest below:
-  fixed    one plan for all scenes, the best on average by the same table and budget, photos spread (farthest point)
-  random   a plan drawn from all whose cost is within 15 % below, photos drawn too
-  uniform  photos and steps cut by one common factor, photos evenly spread, uniform sigma grid; the RGB head alone
-           where the budget does not pay for a generated video
+Beside it stand controls that cost no more, never more:
+  fixed    one plan for all scenes of a tolerance. Its budget is the mean of what the planner spends on them, planning
+           included; within it, the plan whose predicted error (same table, mean over the scenes, each taken as one of
+           an average kind) is least. Photos spread (farthest point)
+  random   a plan drawn for each scene from all whose cost is within 15 % below the planner's, photos drawn too
+  uniform  for each scene, the most photos that the planner's cost pays for, evenly spread, steps cut by the same
+           factor, uniform sigma grid; where that does not pay for a generated video the RGB head alone, where not for
+           that either, the head at half size
+A control without a plan of that cost is null in the document and left out of the comparison, which counts such pairs.
 Errors are RMS colour differences, to the full model's frames (what the tolerance is about) and to the truth.
 The published system has no such chart. Our numbers: docs/planning.md.
 """
 
 import argparse
+import dataclasses
 import json
 import subprocess
 import time
@@ -30,18 +35,19 @@ from pathlib import Path
 import jax
 import numpy as np
 import plan_report
-from plan_runs import CONTEXTS, RUNGS, Engine, LadderScene, fit, make, rms, turn_knobs
+from plan_runs import RUNGS, Engine, LadderScene, fit, make, rms, turn_knobs
 
 from roge_jax import checkpoint
 from roge_jax.data.procedural import HELDOUT_SEED
 from roge_jax.data.scene import select_context
-from roge_jax.planning import coverage, options, table
+from roge_jax.planning import coverage, options, proxies, table
 from roge_jax.planning.plan import plan
+from roge_jax.video import solvers
 
 OUT = Path(__file__).parent / "results" / "plan_ladder.json"
+PAGE = Path(__file__).parents[1] / "docs" / "planning.md"
 TRAIN_SEED = 500_000  # training seeds that no shipped pool used
 TOLERANCES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08)
-CONTROLS = ("fixed", "random", "uniform")
 
 
 def provenance(command: str, scenes: int) -> dict:
@@ -107,45 +113,63 @@ FIELDS = ("steps", "solver", "schedule", "recon", "merge", "generate")
 
 
 def fixed_plan(listed: list[list], budget: float):
-    """The shape within `budget` whose predicted error, the mean over scenes of an average kind, is least."""
+    """The shape within `budget` whose predicted error, the mean over scenes of an average kind, is least; or None."""
     errors: dict[tuple, list[float]] = {}
     for scene_options in listed:
         for o in scene_options:
-            if o.flops <= budget:
+            if o.flops <= budget * plan_report.ROUNDING:
                 errors.setdefault(shape(o.choices), []).append(o.error)
     full = {k: v for k, v in errors.items() if len(v) == len(listed)}
+    if not full:
+        return None
     best = min(full, key=lambda k: (np.mean(full[k]), k[:2]))
     return next(o.choices for o in listed[0] if shape(o.choices) == best)
 
 
-def uniform_plan(engine: Engine, scene: LadderScene, listed: list, budget: float):
-    """Photos and steps cut by one factor; without generation where that costs too much."""
+def random_plan(scene: LadderScene, listed: list, budget: float, rng):
+    """A plan drawn from those within 15 % below the budget, or the nearest below; its photos drawn too."""
+    within = [o for o in listed if o.flops <= budget * plan_report.ROUNDING]
+    if not within:
+        return None
+    near = [o for o in within if o.flops >= 0.85 * budget] or [max(within, key=lambda o: o.flops)]
+    drawn = near[rng.integers(len(near))]
+    photos = rng.permutation(len(scene.photos.ids))[: len(drawn.choices.photos)].tolist()
+    return drawn.flops, dataclasses.replace(drawn.choices, photos=tuple(sorted(photos)))
+
+
+def uniform_plans(engine: Engine, scene: LadderScene) -> list:
+    """(FLOPs, choices), best first: photos and steps cut by one factor; then the RGB head, then at half size too."""
     price = options.Prices(scene.photos, engine.config, engine.settings, 1)
-    found = []
-    for steps in range(1, engine.settings.steps + 1):
-        m = max(1, round(steps * CONTEXTS / engine.settings.steps))
-        spread = tuple(int((i + 0.5) * CONTEXTS / m) for i in range(m))
-        made = engine.choices(scene, photos=spread, steps=steps, schedule="uniform")
-        found += [(steps + 100, price(made, steps), made)]
-        head = engine.choices(scene, photos=spread, generate=(False,))
-        found += [(steps, price(head, 0), head)]
-    affordable = [f for f in found if f[1] <= budget] or [min(found, key=lambda f: f[1])]
-    return max(affordable, key=lambda f: f[0])[1:]
+    everything, steps = len(scene.photos.ids), engine.settings.steps
+    counts = range(everything, 0, -1)
+    spread = {m: tuple(int((i + 0.5) * everything / m) for i in range(m)) for m in counts}
+    made = [
+        engine.choices(
+            scene, photos=spread[m], steps=max(1, round(steps * m / everything)), schedule="uniform"
+        )
+        for m in counts
+    ]
+    small = proxies.half_size(engine.config)
+    sizes = [{}] + [{"recon": (small.recon_height, small.recon_width)}] * bool(small)
+    made += [
+        engine.choices(scene, photos=spread[m], generate=(False,), **size)
+        for size in sizes
+        for m in counts
+    ]
+    return [(price(c, solvers.nfe(c.solver, c.steps)), c) for c in made]
 
 
-def climb(engine: Engine, scenes_per_rung: int, rungs=RUNGS) -> dict:
+def best_within(plans: list, budget: float):
+    """The first of (FLOPs, choices) that costs no more than `budget`, or None."""
+    return next((p for p in plans if p[0] <= budget * plan_report.ROUNDING), None)
+
+
+def climb(engine: Engine, scenes: list[LadderScene]) -> dict:
     """All plans of all scenes, with predicted and realised errors."""
     constants = table.load(engine.config.name)
-    scenes = [
-        make(rung, HELDOUT_SEED + i, engine.config)
-        for i in range(scenes_per_rung)
-        for rung in rungs
-    ]
-    rows = []
-    plans = {}
-    for number, scene in enumerate(scenes):
-        for tolerance in TOLERANCES:
-            plans[number, tolerance] = plan(
+    plans = [
+        [
+            plan(
                 engine.params,
                 engine.config,
                 scene.photos,
@@ -153,73 +177,72 @@ def climb(engine: Engine, scenes_per_rung: int, rungs=RUNGS) -> dict:
                 tolerance=tolerance,
                 compiled=engine.programs,
             )
+            for tolerance in TOLERANCES
+        ]
+        for scene in scenes
+    ]
     average = [every_option(engine, scene, {}, constants) for scene in scenes]
-    fixed = {
-        t: fixed_plan(average, np.mean([spent(plans[n, t]) for n in range(len(scenes))]) * 1.02)
-        for t in TOLERANCES
-    }
-    for number, scene in enumerate(scenes):
+    fixed = [
+        fixed_plan(average, float(np.mean([spent(made) for made in column])))
+        for column in zip(*plans, strict=True)
+    ]
+    rows = []
+    for scene, listed, made in zip(scenes, average, plans, strict=True):
         began = time.process_time()
-        listed = average[number]
-        price = {o.choices: o.flops for o in listed}
-        full = engine.choices(scene)
-        reference = engine.run(scene, full)
-        head = engine.choices(scene, generate=(False,))
-        rng = np.random.default_rng(scene.seed)
-        row = {
-            "rung": scene.rung,
-            "seed": scene.seed,
-            "bits_per_pixel": scene.bits,
-            "full": {"flops": price[full], "truth": rms(reference, scene.truth)},
-            "head": {
-                "flops": price[head],
-                "full": rms(engine.run(scene, head), reference),
-                "truth": rms(engine.run(scene, head), scene.truth),
-            },
-            "plans": [],
-        }
-        for tolerance in TOLERANCES:
-            made = plans[number, tolerance]
-            budget = spent(made)
-            some = fixed[tolerance]
-            photos = tuple(select_context(scene.photos.cameras, len(some.photos)))
-            near = [o for o in listed if 0.85 * budget <= o.flops <= budget] or [
-                max((o for o in listed if o.flops <= budget), key=lambda o: o.flops, default=None)
-                or min(listed, key=lambda o: o.flops)
-            ]
-            drawn = near[rng.integers(len(near))]
-            any_photos = rng.permutation(CONTEXTS)[: len(drawn.choices.photos)].tolist()
-            even_cost, even = uniform_plan(engine, scene, listed, budget)
-            runs = {
-                "planner": (made.choices, budget),
-                "fixed": (
-                    engine.choices(scene, photos=photos, **fields(some)),
-                    cost_of(price, some),
-                ),
-                "random": (
-                    engine.choices(
-                        scene, photos=tuple(sorted(any_photos)), **fields(drawn.choices)
-                    ),
-                    drawn.flops,
-                ),
-                "uniform": (even, even_cost),
-            }
-            entry = {"tolerance": tolerance, "predicted": made.predicted_error}
-            entry["planning_flops"] = made.planning_cost
-            for name, (choices, flops) in runs.items():
-                frames = engine.run(scene, choices)
-                entry[name] = {
-                    "flops": flops,
-                    "full": rms(frames, reference),
-                    "truth": rms(frames, scene.truth),
-                    "photos": list(choices.photos),
-                    **{f: getattr(choices, f) for f in FIELDS},
-                }
-            row["plans"].append(entry)
+        rows.append(run_scene(engine, scene, listed, made, fixed))
         scene.kept.clear()
-        rows.append(row)
         print(f"{time.process_time() - began:.0f} s {scene.rung} {scene.seed}", flush=True)
     return {"rows": rows}
+
+
+def run_scene(engine: Engine, scene: LadderScene, listed: list, made: list, fixed: list) -> dict:
+    """The planner's plans of one scene and the controls beside each: a row of the document."""
+    price = {shape(o.choices): o.flops for o in listed}
+    full = engine.choices(scene)
+    reference = engine.run(scene, full)
+    head = engine.choices(scene, generate=(False,))
+    rng = np.random.default_rng(scene.seed)
+    uniform = uniform_plans(engine, scene)
+
+    def measured(found) -> dict | None:
+        if found is None:
+            return None
+        flops, choices = found
+        frames = engine.run(scene, choices)
+        return {
+            "flops": flops,
+            "full": rms(frames, reference),
+            "truth": rms(frames, scene.truth),
+            "photos": list(choices.photos),
+            **fields(choices),
+        }
+
+    plans = []
+    for own, some in zip(made, fixed, strict=True):
+        budget = spent(own)
+        one = None
+        if some is not None:
+            photos = tuple(select_context(scene.photos.cameras, len(some.photos)))
+            one = price[shape(some)], engine.choices(scene, photos=photos, **fields(some))
+        entry = {"tolerance": own.tolerance, "predicted": own.predicted_error}
+        entry["planning_flops"] = own.planning_cost
+        entry["planner"] = measured((budget, own.choices))
+        entry["fixed"] = measured(one)
+        entry["random"] = measured(random_plan(scene, listed, budget, rng))
+        entry["uniform"] = measured(best_within(uniform, budget))
+        plans.append(entry)
+    return {
+        "rung": scene.rung,
+        "seed": scene.seed,
+        "bits_per_pixel": scene.bits,
+        "full": {"flops": price[shape(full)], "truth": rms(reference, scene.truth)},
+        "head": {
+            "flops": price[shape(head)],
+            "full": rms(engine.run(scene, head), reference),
+            "truth": rms(engine.run(scene, head), scene.truth),
+        },
+        "plans": plans,
+    }
 
 
 def spent(made) -> float:
@@ -230,32 +253,36 @@ def fields(choices) -> dict:
     return {f: getattr(choices, f) for f in FIELDS}
 
 
-def cost_of(price: dict, choices) -> float:
-    """FLOPs of choices by their shape."""
-    return next(flops for known, flops in price.items() if shape(known) == shape(choices))
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("scenes", nargs="?", type=int, default=4, help="scenes per rung")
     parser.add_argument("--calibrate", type=int, metavar="SCENES", help="measure the table instead")
-    parser.add_argument("--draw", action="store_true", help="only draw the stored results again")
+    parser.add_argument(
+        "--draw", action="store_true", help="summary, picture and table of stored rows"
+    )
     args = parser.parse_args()
     if not args.draw:
         engine = Engine(*checkpoint.load_model("mini"))
         if args.calibrate:
             return calibrate(engine, args.calibrate)
-        document = climb(engine, args.scenes)
+        scenes = [
+            make(rung, HELDOUT_SEED + i, engine.config)
+            for i in range(args.scenes)
+            for rung in RUNGS
+        ]
+        document = climb(engine, scenes)
         command = f"python experiments/plan_ladder.py {args.scenes}"
         document["provenance"] = provenance(command, len(document["rows"]))
         document["provenance"]["table"] = table.load("mini").provenance
-        document["summary"] = plan_report.summarise(document["rows"])
-        OUT.write_text(json.dumps(document, indent=1) + "\n")
-        print(f"wrote {OUT}")
-    document = json.loads(OUT.read_text())
+    else:
+        document = json.loads(OUT.read_text())
+    document["summary"] = plan_report.summarise(document["rows"])
+    OUT.write_text(json.dumps(document, indent=1) + "\n")
     plan_report.draw(document, OUT.with_suffix(".png"))
+    plan_report.write_table(document, PAGE)
+    print(f"wrote {OUT}, its picture and the table of {PAGE}")
     print(plan_report.words(document["summary"]))
 
 

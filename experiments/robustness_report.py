@@ -49,8 +49,10 @@ KNOBS = {
 # The run-time measure (of `roge_jax.limits`) that shows a knob, where one does.
 SHOWN = {
     "extrapolation": "extrapolation", "wider": "field_ratio", "narrower": "field_ratio",
-    "photos": "distinct_photos", "exposure": "exposure_stops", "blur": "sharpness",
+    "photos": "distinct_photos", "exposure": "exposure_stops", "blur": "sharpness", "noise": "noise",
 }  # fmt: skip
+ESTIMATED = ("exposure_stops", "sharpness", "noise")  # from photos: what they show counts as well
+USUAL = 0.95  # share of the undisturbed scenes that must lie within a limit on an estimate
 
 
 # ---- where it breaks -----------------------------------------------------------------------------
@@ -116,8 +118,13 @@ def breaks(found: dict[str, dict]) -> dict[str, dict[str, Any]]:
     return result
 
 
-def limit_rows(found: dict, broken: dict) -> dict[str, dict[str, Any]]:
-    """The rows of `limits.json`: the earlier 1 dB break of the two outputs in units of the run-time measure."""
+def limit_rows(
+    found: dict, broken: dict, undisturbed: dict[str, list[float]]
+) -> dict[str, dict[str, Any]]:
+    """The rows of `limits.json`: the earlier 1 dB break of the two outputs in units of the run-time measure.
+
+    A limit on a measure in `undisturbed` ({measure: [scenes]}) lies no further in than their `USUAL` quantile.
+    """
     rows = {}
     for knob, measured in SHOWN.items():
         levels, log = np.array(found[knob]["levels"]), KNOBS[knob].log
@@ -132,14 +139,21 @@ def limit_rows(found: dict, broken: dict) -> dict[str, dict[str, Any]]:
         order = np.argsort(x)
         limit = float(np.interp(np.log(at) if log else at, x[order], values[order]))
         sign = 1.0 if values[-1] > values[0] else -1.0  # warn above or below
+        still, measured_limit = per_scene[0], limit
+        if measured in undisturbed:
+            still = np.array(undisturbed[measured])
+            limit = sign * max(sign * limit, float(np.quantile(sign * still, USUAL)))
         rows[knob] = {
             "limit": limit,
+            "measured_limit": measured_limit,
+            "moved": limit != measured_limit,
             "broke": first is not None,
             "measure": measured,
             "knob": at,
             "interval": ends[first]["interval"] if first else [None, None],
             "output": first,
-            "undisturbed_beyond": float((sign * per_scene[0] > sign * limit).mean()),
+            "undisturbed_beyond": float((sign * still > sign * limit).mean()),
+            "undisturbed_scenes": len(still),
             "last_level_beyond": float((sign * per_scene[-1] >= sign * limit).mean()),
         }
     return rows
@@ -282,6 +296,10 @@ def summary(document: dict) -> str:
     ]
     for kind, row in document["limits"].items():
         limit = f"{row['limit']:.3g}" + ("" if row["broke"] else " (end of the range)")
+        if row["moved"]:
+            limit += (
+                f" (measured {row['measured_limit']:.3g}, moved to the undisturbed {USUAL:.0%})"
+            )
         shares = f"{row['undisturbed_beyond']:.0%} | {row['last_level_beyond']:.0%}"
         lines.append(f"| {kind}: {row['measure']} | {limit} | {shares} |")
     return "\n".join(lines)

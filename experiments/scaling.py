@@ -2,7 +2,7 @@
 
     python -m experiments.scaling          minutes, any machine: nothing is allocated or measured
 
-Memory and work are those of `roge_jax.training.plan` (the step traced on abstract arrays), volumes are arithmetic on
+Memory and work are those of `roge_jax.training.estimate` (the step traced on abstract arrays), volumes are arithmetic on
 specs and the sharding table; assumptions stand in `docs/scaling.md`, whose tables this program rewrites. The paper trains on 192 H20 GPUs at batch 1 each and
 states neither memory nor time per step. Writes experiments/results/scaling.json.
 """
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from roge_jax import config, cost
 from roge_jax.core import sharding
 from roge_jax.core.params import flatten
-from roge_jax.training import plan, stages
+from roge_jax.training import estimate, stages
 
 HERE = Path(__file__).parent
 RESULT = HERE / "results" / "scaling.json"
@@ -43,10 +43,10 @@ def stage(cfg: config.RoGeConfig, remat: str, scenes: int, *, recon_trains: bool
     return dataclasses.replace(found, remat=remat, batch=scenes)
 
 
-def planned(cfg, m: int, remat: str, sizes, *, recon_trains: bool) -> plan.Plan:
+def planned(cfg, m: int, remat: str, sizes, *, recon_trains: bool) -> estimate.Estimate:
     """The step on one device of the mesh: one scene on each group of `seq` GPUs, bfloat16, fused attention."""
     data, fsdp, _ = sizes
-    return plan.plan(
+    return estimate.estimate(
         cfg,
         stage(cfg, remat, data * fsdp, recon_trains=recon_trains),
         m=m,
@@ -56,7 +56,9 @@ def planned(cfg, m: int, remat: str, sizes, *, recon_trains: bool) -> plan.Plan:
     )
 
 
-def communication(cfg: config.RoGeConfig, found: plan.Plan, sizes, *, recon_trains: bool) -> dict:
+def communication(
+    cfg: config.RoGeConfig, found: estimate.Estimate, sizes, *, recon_trains: bool
+) -> dict:
     """Bytes that one device receives in one step with full rematerialisation."""
     data, fsdp, seq = sizes
     passes = 2  # forward; backward, which recomputes with the same gathered block
@@ -163,10 +165,10 @@ def growth() -> tuple[list[dict], list[str]]:
     return rows, [*lines, ""]
 
 
-def work_table(title: str, x: plan.Plan) -> list[str]:
+def work_table(title: str, x: estimate.Estimate) -> list[str]:
     lines = [f"**{title}**", "", "| TFLOP | forward | recomputed | backward |", "|---|---|---|---|"]
     for name, passes in x.work.items():
-        cells = [f"{passes[p] / 1e12:.1f}" for p in plan.PASSES]
+        cells = [f"{passes[p] / 1e12:.1f}" for p in estimate.PASSES]
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return [*lines, ""]
 

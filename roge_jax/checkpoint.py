@@ -21,6 +21,7 @@ from .config import PRESETS, RoGeConfig, from_dict, to_dict
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
 from .fields import exists, is_file, read_json
+from .folders import fingerprint, put, sync
 
 SHARD_BYTES = 15_000_000
 ADAPTER = "adapter.safetensors"
@@ -47,14 +48,18 @@ class Checkpoints:
         return self._manager.latest_step()
 
     def save(self, step: int, state: Tree) -> None:
-        """Write the state after `step` steps, and then the checksums of its files. All processes must call it."""
+        """Write the state after `step` steps, and then the checksums of its files, all of it to the disk.
+
+        All processes must call it.
+        """
         self._manager.save(step, args=self._ocp.args.StandardSave(state))
         self._manager.wait_until_finished()
         if jax.process_index() == 0:
             folder = self.folder / str(step)
+            sync(folder)
             temporary = folder / f"{CHECKSUMS}.part"
             temporary.write_text(json.dumps(_checksums(folder), indent=1) + "\n")
-            temporary.replace(folder / CHECKSUMS)
+            put(temporary, folder / CHECKSUMS)
 
     def verify(self, step: int) -> None:
         """Raise a UserError if a file of the state of `step` has changed or is gone since it was written.
@@ -140,17 +145,13 @@ def save_model(
         save_file(shard, temporary / f"model-{i:05d}-of-{len(shards):05d}.safetensors")
     record = {"format": 1, "config": to_dict(config), "provenance": provenance or {}}
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
-    _put(temporary, folder)
+    put(temporary, folder)
 
 
-def _put(temporary: Path, folder: Path) -> None:
-    """Rename a finished folder to `folder`; what was there is gone only then."""
-    old = folder.with_name(folder.name + ".old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    temporary.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+def model_fingerprint(params: Tree, config: RoGeConfig) -> str:
+    """Twelve hex digits that tell this model from another, by weights and configuration alone (`folders.fingerprint`)."""
+    leaves = ((path, np.asarray(leaf)) for path, leaf in flatten(params).items())
+    return fingerprint(leaves, json.dumps(to_dict(config), sort_keys=True))
 
 
 def find_model(name: str | Path) -> Path:
@@ -270,7 +271,7 @@ def save_adapter(
     }
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
     (temporary / "README.md").write_text(adapter_card(leaves, config, provenance or {}))
-    _put(temporary, folder)
+    put(temporary, folder)
 
 
 def load_adapter(folder: str | Path) -> tuple[Tree, RoGeConfig]:

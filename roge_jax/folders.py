@@ -1,17 +1,21 @@
 """Output folders that are whole or absent, and that one run at a time writes."""
 
 import contextlib
+import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .errors import UserError
 from .fields import is_file, read_json
 
 RECORD = "run.json"  # what marks a folder as that of an earlier run
+BLOCK_BYTES, BLOCKS = 65536, 16  # what `fingerprint` reads of a large array
 
 
 @contextlib.contextmanager
@@ -23,7 +27,7 @@ def output_folder(out: str | Path) -> Iterator[Path]:
     there, before anything is computed.
     """
     given, out = out, _resolved(Path(out))
-    part, old = (out.with_name(out.name + suffix) for suffix in (".part", ".old"))
+    part = out.with_name(out.name + ".part")
     try:
         if out.exists() and not out.is_dir():
             raise UserError(f"--out {given} is a file: give a folder.")
@@ -45,11 +49,67 @@ def output_folder(out: str | Path) -> Iterator[Path]:
         except BaseException:
             shutil.rmtree(part, ignore_errors=True)
             raise
+        put(part, out)
+
+
+def put(temporary: Path, final: Path) -> None:
+    """Rename a finished file or folder to its place; what was there is gone only then.
+
+    The contents are on the disk before the name is, and the name is when this returns: a loss of power leaves the old
+    or the new, never half of one.
+    """
+    old = final.with_name(final.name + ".old")
+    sync(temporary)
+    if temporary.is_dir():
         shutil.rmtree(old, ignore_errors=True)
-        if out.exists():
-            out.rename(old)
-        part.rename(out)
-        shutil.rmtree(old, ignore_errors=True)
+        if final.exists():
+            final.rename(old)
+    temporary.replace(final)
+    _sync_one(final.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def sync(path: Path) -> None:
+    """A file, or a folder and all below it, is on the disk when this returns."""
+    for place in [*(path.rglob("*") if path.is_dir() else []), path]:
+        if place.is_file() or place.is_dir():
+            _sync_one(place)
+
+
+def _sync_one(path: Path) -> None:
+    if os.name == "nt":  # no handle that it could be done with
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        # Some network file systems know it for files alone.
+        with contextlib.suppress(OSError) if path.is_dir() else contextlib.nullcontext():
+            os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def fingerprint(parts: Iterable[tuple[str, np.ndarray]], more: str = "") -> str:
+    """Twelve hex digits that tell contents apart: of names, shapes, dtypes and bytes of arrays, and of a text.
+
+    Of an array above 1 MiB 16 blocks are read, evenly spaced from the first byte to the last: gigabytes of trained
+    weights take a second, and a change of a few numbers alone may be missed.
+    """
+    digest = hashlib.sha256(more.encode())
+    for name, x in parts:
+        digest.update(f"\n{name} {x.shape} {x.dtype}\n".encode())
+        flat = np.ascontiguousarray(x).reshape(-1).view(np.uint8)
+        if flat.size <= BLOCKS * BLOCK_BYTES:
+            digest.update(flat.data)
+            continue
+        for start in np.linspace(0, flat.size - BLOCK_BYTES, BLOCKS).astype(np.int64):
+            digest.update(flat[start : start + BLOCK_BYTES].data)
+    return digest.hexdigest()[:12]
+
+
+def fingerprint_files(folder: Path, *patterns: str) -> str:
+    """`fingerprint` of the files in a folder, by their names there: the same wherever the folder lies."""
+    files = sorted({file for pattern in patterns for file in folder.glob(pattern)})
+    return fingerprint((f.name, np.memmap(f, np.uint8, "r")) for f in files if f.stat().st_size)
 
 
 def output_file(file: Path, option: str, *suffixes: str) -> Path:
@@ -73,15 +133,24 @@ def output_file(file: Path, option: str, *suffixes: str) -> Path:
     return file
 
 
-def keep_settings(folder: Path, settings: dict[str, Any], *, begun: bool, resume: bool) -> None:
+def keep_settings(
+    folder: Path,
+    settings: dict[str, Any],
+    *,
+    begun: bool,
+    resume: bool,
+    notes: dict[str, Any] | None = None,
+) -> dict[str, Any]:
     """Write what a run in `folder` was started with, or hold a run that continues it (`resume`) against that.
 
-    `begun`: whether the folder has something to continue. Raises: UserError naming the setting that differs. Runs
-    without the file (settings.json) pass.
+    `begun`: whether the folder has something to continue. `notes` are written beside the settings and may differ.
+    Returns what the run was started with. Raises: UserError naming the setting that differs. Settings that the file
+    (settings.json) does not hold pass.
     """
     file = Path(folder) / "settings.json"
+    whole = settings | (notes or {})
     if begun:
-        before = read_json(file, "settings of the run") if resume and is_file(file) else settings
+        before = read_json(file, "settings of the run") if resume and is_file(file) else whole
         if not isinstance(before, dict):
             raise UserError(
                 f"{file} holds no settings of a run: delete it to continue without this check."
@@ -92,11 +161,12 @@ def keep_settings(folder: Path, settings: dict[str, Any], *, begun: bool, resume
                     f"{folder} holds a run with {name} {before[name]}, and {value} is asked for: continue it with the "
                     "same, or choose another --out."
                 )
-        return
+        return before
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_suffix(".json.part")
-    temporary.write_text(json.dumps(settings, indent=1) + "\n")
-    temporary.replace(file)
+    temporary.write_text(json.dumps(whole, indent=1) + "\n")
+    put(temporary, file)
+    return whole
 
 
 def _resolved(out: Path) -> Path:

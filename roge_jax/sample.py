@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 
 from .entry import Clock, environment, number, one_of, run, write_json
-from .errors import UserError, did_you_mean
+from .errors import UserError
 from .fields import is_file
 from .folders import output_folder
 
-DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
+SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
+RENDERED = 32  # views of a procedural scene
 TRAJECTORY = "orbit:degrees=12"  # gentle: two photos side by side show little of the rest
 DTYPES = ("auto", "float32", "bfloat16")
 LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
@@ -32,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
-    from .sampling import LONG, SLOTS
+    from .sampling import DEFAULT_CONTEXT, LONG, SLOTS
     from .video.flow import SCHEDULES
     from .video.solver_table import SOLVERS
 
@@ -48,13 +49,14 @@ def parser() -> argparse.ArgumentParser:
 
     real, own = number(1e-30, whole=False), "; the model's own if not given"
     option("--checkpoint", "model folder, or the name of a shipped one", "mini")
-    option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", "motorcycle")
+    option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", SCENE)
     paths = ", ".join(sorted(PRESETS))
     path_help = (
         f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false"
     )
     option("--trajectory", path_help, TRAJECTORY, metavar="NAME|FILE")
-    option("--frames", "length of the path; the model's window, or the file's own", type=number(1))
+    frames_help = f"length of the path, up to {MOST_FRAMES}; the model's window, or the file's own"
+    option("--frames", frames_help, type=number(1))
     option("--steps", f"sampling steps{own}", type=number(1))
     option("--solver", f"{', '.join(SOLVERS)}{own}", type=one_of(SOLVERS))
     option("--schedule", f"{', '.join(SCHEDULES)}{own}", type=one_of(SCHEDULES))
@@ -128,42 +130,12 @@ def model_config(args: argparse.Namespace, *, weights: bool):
     )
 
 
-def context_ids(text: str | None, scene, most: int) -> list[int]:
-    """The views that --context asks for."""
-    from .data.scene import select_context
-
-    if text is None:
-        return select_context(scene, min(len(scene), most, DEFAULT_CONTEXT))
-    words = [word.strip() for word in text.split(",")]
-    if any(words) and ("," in text or text in scene.names):
-        return [_view(word, scene) for word in words if word]
-    if not text.isdecimal() or not 1 <= int(text) <= min(len(scene), most):
-        raise UserError(
-            f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
-            f"model takes {most}), or photos by number or name, separated by commas."
-        )
-    return select_context(scene, int(text))
-
-
-def _view(word: str, scene) -> int:
-    if word in scene.names:
-        return scene.names.index(word)
-    if word.isdecimal() and int(word) < len(scene):
-        return int(word)
-    if word.isdecimal():
-        raise UserError(
-            f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0."
-        )
-    raise UserError(
-        f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}"
-    )
-
-
 def camera_path(args: argparse.Namespace, context, config):
     """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video."""
     from .geometry.cameras import Cameras
     from .geometry.trajectories import PRESETS, load_path, make_path, parse_options
 
+    _check_length(args.frames or 0, f"--frames {args.frames}")
     name, _, words = args.trajectory.partition(":")
     file = Path(args.trajectory)
     if file.suffix.lower() == ".json" or is_file(file):
@@ -173,6 +145,7 @@ def camera_path(args: argparse.Namespace, context, config):
             )
         size = {"height": config.height, "width": config.width}
         path = load_path(args.trajectory, frames=args.frames, context=context, **size)
+        _check_length(len(path), str(file))
     elif name not in PRESETS and ("/" in name or "." in name):
         raise UserError(f"--trajectory {args.trajectory}: there is no such path file.")
     else:
@@ -193,6 +166,13 @@ def camera_path(args: argparse.Namespace, context, config):
         K = np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
         path = Cameras(np.repeat(K[None], len(path), 0), path.c2w)
     return path
+
+
+def _check_length(frames: int, where: str) -> None:
+    if frames > MOST_FRAMES:
+        raise UserError(
+            f"{where}: give a path of at most {MOST_FRAMES} frames, since all are in memory until they are written."
+        )
 
 
 def large_dtype(args: argparse.Namespace, parameters: float) -> str:
@@ -332,18 +312,12 @@ def main(args: argparse.Namespace) -> None:
     )
     if args.dry_run:
         return print(dry_run(args, settings))
-    from .data.scene import load_scene
-
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
     settings = settings.of(config)
     with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
-            scene = load_scene(args.scene, convention=args.convention)
-            photos = sampling.read_photos(
-                scene, context_ids(args.context, scene, config.max_context), config
-            )
-            path = camera_path(args, photos.cameras, config)
+            scene, photos, path = read_inputs(args, config, settings)
             params, _ = load_weights(args, mesh)
         print(
             f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
@@ -384,51 +358,75 @@ def main(args: argparse.Namespace) -> None:
     )
 
 
+def read_inputs(args: argparse.Namespace, config, settings, scene=None):
+    """(scene, photos, path), after all checks that need no weights; `settings` are those of the model."""
+    from .data.scene import load_scene
+    from .geometry.cameras import normalise
+    from .sampling import context_ids, noise_levels, read_photos
+
+    scene = scene or load_scene(args.scene, convention=args.convention)
+    photos = read_photos(scene, context_ids(args.context, scene, config.max_context), config)
+    path = camera_path(args, photos.cameras, config)
+    normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
+    noise_levels(settings, config)
+    return scene, photos, path
+
+
 def dry_run(args: argparse.Namespace, settings) -> str:
-    """Shapes, tokens, FLOPs and memory as text; weights are not read, photos are not decoded."""
-    from . import cost, sampling
-    from .data.scene import open_scene, procedural_seed
+    """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
+    from . import cost, model, sampling
+    from .core import sharding
     from .video import solvers
 
-    config = model_config(args, weights=False)
-    settings = settings.of(config)
-    if args.context is not None and args.context.isdecimal():
-        m = int(args.context)
-        if not 1 <= m <= config.max_context:
-            raise UserError(
-                f"--context {m}: this model ({config.name}) takes 1 to {config.max_context} photos."
-            )
-    elif args.scene.startswith("procedural:"):
-        procedural_seed(args.scene)
-        m = min(DEFAULT_CONTEXT, config.max_context)
-    else:
-        scene = open_scene(args.scene, convention=args.convention)
-        m = len(context_ids(args.context, scene, config.max_context))
-    frames = len(camera_path(args, _stand_in(m, config), config))
+    config, mesh = model_config(args, weights=False), sampling_mesh(args)
+    settings, notes = settings.of(config), []
+    if mesh is not None:
+        sharding.shardings(model.specs(config), mesh)
+        notes.append(f"note: FLOPs and memory are those of all {mesh.size} devices together")
+    scene = stand_in(args, config)
+    _, photos, path = read_inputs(args, config, settings, scene)
+    if scene is not None:
+        notes.append("note: for any scene with so many photos; none was read")
+    m = len(photos.ids)
+    if args.tolerance is not None or args.max_cost is not None:
+        from .planning.plan import plan as make_plan
+
+        limits = {"tolerance": args.tolerance or 0.0, "max_cost": args.max_cost}
+        plan = make_plan({}, config, photos, path, settings=settings, probe=0.0, **limits)
+        notes.append(
+            f"the above is the full model's cost, the most that a plan can take\n{plan.explain()}"
+        )
+        notes.append(
+            "  note: for an average scene; the run measures this one first, with the weights"
+        )
     adaptive = solvers.SOLVERS[settings.solver].method is None
     count = 3 * settings.steps if adaptive else solvers.nfe(settings.solver, settings.steps)
     guess = " (a guess: it chooses its own steps)" if adaptive else ""
-    return cost.report(
+    text = cost.report(
         config,
         m,
         count,
-        frames=frames,
+        frames=len(path),
         later=sum(sampling.chained(m, config)) if settings.long == "chain" else m,
         half=large_dtype(args, sum(cost.weight_bytes(config).values()) / 4) == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
+    return "\n".join([text, *notes])
 
 
-def _stand_in(m: int, config):
-    """Cameras side by side: enough to know a path's length and whether its options are allowed."""
-    from .geometry.cameras import Cameras
+def stand_in(args: argparse.Namespace, config):
+    """A blank scene where the one asked for takes a minute to render (procedural), or none was chosen and the built-in
+    one has fewer photos than --context asks for; else None."""
+    from .data.procedural import split_of
+    from .data.scene import procedural_seed
+    from .sampling import blank_scene
 
-    K = np.array(
-        [[config.width, 0, config.width / 2], [0, config.width, config.height / 2], [0, 0, 1]]
-    )
-    c2w = np.tile(np.eye(4), (m, 1, 1))
-    c2w[:, 0, 3] = 0.1 * np.arange(m)
-    return Cameras(np.tile(K, (m, 1, 1)), c2w)
+    if args.scene.startswith("procedural:"):
+        split_of(procedural_seed(args.scene))  # raises for a seed out of range
+        return blank_scene(args.scene, RENDERED, config)
+    count = int(args.context) if (args.context or "").isdecimal() else 0
+    asked = args.scene == SCENE and 2 < count <= config.max_context
+    return blank_scene(SCENE, count, config) if asked else None
 
 
 if __name__ == "__main__":

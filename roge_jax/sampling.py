@@ -24,7 +24,7 @@ from . import fields, limits, model, programs
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
-from .data.scene import Scene, distinct_views
+from .data.scene import Scene, distinct_views, select_context
 from .data.scene import prepare as prepare_photos
 from .errors import UserError, did_you_mean
 from .geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
@@ -33,6 +33,7 @@ from .windows import CHAIN_FRAMES, chain_views, chained, view_distance, window_v
 
 __all__ = ["CHAIN_FRAMES", "chain_views", "chained", "view_distance", "window_views", "windows"]
 
+DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
 LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
@@ -120,6 +121,35 @@ class Result:
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
+def context_ids(text: str | None, scene: Scene, most: int) -> list[int]:
+    """The views that --context asks for: how many, or which by number or name; a model takes `most`."""
+    if text is None:
+        return select_context(scene, min(len(scene), most, DEFAULT_CONTEXT))
+    words = [word.strip() for word in text.split(",")]
+    if any(words) and ("," in text or text in scene.names):
+        return [_view(word, scene) for word in words if word]
+    if not text.isdecimal() or not 1 <= int(text) <= min(len(scene), most):
+        raise UserError(
+            f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
+            f"model takes {most}), or photos by number or name, separated by commas."
+        )
+    return select_context(scene, int(text))
+
+
+def _view(word: str, scene: Scene) -> int:
+    if word in scene.names:
+        return scene.names.index(word)
+    if word.isdecimal() and int(word) < len(scene):
+        return int(word)
+    if word.isdecimal():
+        raise UserError(
+            f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0."
+        )
+    raise UserError(
+        f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}"
+    )
+
+
 def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
     """The photos `ids` of a scene, the first one being the world frame. Duplicates are dropped with a warning."""
     images, cameras = prepare_photos(scene, ids, config.height, config.width, drop_duplicates=False)
@@ -139,6 +169,17 @@ def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
     ):  # sharper than a resize of the smaller crop
         recon, _ = prepare_photos(scene, ids, *size, drop_duplicates=False)
     return Photos(images[kept], recon, cameras[kept], tuple(ids))
+
+
+def blank_scene(source: str, views: int, config: RoGeConfig) -> Scene:
+    """Black photos of the model's size from cameras side by side: what a run costs does not depend on more."""
+    w, h = config.width, config.height
+    K = np.array([[w, 0.0, w / 2], [0.0, w, h / 2], [0.0, 0.0, 1.0]])
+    c2w = np.tile(np.eye(4), (views, 1, 1))
+    c2w[:, 0, 3] = 0.1 * np.arange(views)
+    images = [np.zeros((h, w, 3), np.uint8)] * views
+    names = tuple(f"{i:04d}" for i in range(views))
+    return Scene(images, Cameras(np.tile(K, (views, 1, 1)), c2w), names, source)
 
 
 def _check_photos(photos: Photos, config: RoGeConfig) -> None:
@@ -178,6 +219,17 @@ def reduced(
         settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
     )
     return photos, config, settings
+
+
+def noise_levels(settings: Settings, config: RoGeConfig) -> np.ndarray:
+    """The noise levels [steps + 1] of settings that leave nothing open (`Settings.of`)."""
+    return flow.schedule(
+        settings.schedule,
+        settings.steps,
+        shift=config.flow.shift,
+        solver=settings.solver,
+        model=config.name,
+    )
 
 
 def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
@@ -224,13 +276,7 @@ def sample(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale
     )
     warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
-    grid = flow.schedule(
-        settings.schedule,
-        settings.steps,
-        shift=config.flow.shift,
-        solver=settings.solver,
-        model=config.name,
-    )
+    grid = noise_levels(settings, config)
     runs = windows(len(path), config.frames)
     generate = [True] * len(runs) if plan is None else list(plan.choices.generate)
     if len(generate) != len(runs):

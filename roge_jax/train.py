@@ -17,7 +17,6 @@ import math
 from pathlib import Path
 
 from .entry import number
-from .folders import keep_settings
 
 
 def parser() -> argparse.ArgumentParser:
@@ -33,7 +32,7 @@ def parser() -> argparse.ArgumentParser:
         help="lora (default): LoRA on both halves + new embeddings, the paper's joint training;\n"
         "hires: the same with the reconstruction frozen, at --size;\n"
         "vae_images, vae_clips, vae_longer, recon_low, recon, lookup, prior, generator, vae_decoder, joint: one stage\n"
-        "of the recipe that makes a small model from nothing; all: all of them in order",
+        "of the recipe that makes a small model from nothing; all: these in order, then lora, then hires",
     )
     p.add_argument(
         "--init",
@@ -52,7 +51,7 @@ def parser() -> argparse.ArgumentParser:
         "--scale",
         type=number(1e-6, 1e6, whole=False),
         default=1.0,
-        help="multiplies the steps of every stage of --stage all",
+        help="multiplies the stage's own number of steps, of every stage of 'all'",
     )
     p.add_argument("--batch", type=number(1), help="scenes per step (default: the stage's own)")
     p.add_argument(
@@ -61,7 +60,9 @@ def parser() -> argparse.ArgumentParser:
         help="learning rate (default: the stage's own)",
     )
     p.add_argument(
-        "--size", help="HEIGHTxWIDTH (default: the model's own; stage hires: 1.5 times that)"
+        "--size",
+        help="HEIGHTxWIDTH (default: the model's own, for stage hires twice that); in 'all' that of the stages\n"
+        "before hires, which doubles it",
     )
     p.add_argument("--seed", type=number(0), default=0)
     p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
@@ -135,6 +136,7 @@ def main(args: argparse.Namespace) -> None:
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
     from . import checkpoint, config
+    from .training import start
 
     preset, init = config.preset(args.preset), starting_point(args)
     with on_host():
@@ -146,8 +148,12 @@ def main(args: argparse.Namespace) -> None:
             params, cfg = checkpoint.load_model(init)
     check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
+    if args.stage == "all" and args.data:
+        for stage in chosen:  # now, not after hours
+            start.open_data(args.data, stage, stage_size(args, stage, cfg))
     for stage in chosen:
-        params, cfg = run_stage(args, stage, params, cfg, mesh)
+        params, cfg = run_stage(args, stage, params, stage_size(args, stage, cfg), mesh, init)
+        init = str(args.out / stage.name / "model")
 
 
 def starting_point(args: argparse.Namespace) -> str:
@@ -171,10 +177,18 @@ def choose(args: argparse.Namespace, cfg):
     from . import model
     from .core.params import count
     from .errors import UserError
-    from .training import plan
+    from .training import estimate
     from .training import stages as stages_
 
-    recipe = stages_.mini_stages(args.scale, frames=cfg.frames)
+    if args.stage == "hires" or args.size:
+        cfg = resize(cfg, args.size)
+    side = min(cfg.height, cfg.width)
+    recipe = stages_.mini_stages(args.scale, frames=cfg.frames, side=side)
+    for hires in (False, True):
+        steps = max(1, round(200 * args.scale))
+        stage = stages_.lora_stage(steps, frames=cfg.frames, hires=hires)
+        small = count(model.specs(cfg)) < estimate.LARGE
+        recipe.append(stages_.for_one_scene(stage) if small else stage)
     if not cfg.renderer.lookup:
         if args.stage == "lookup":
             raise UserError(
@@ -182,19 +196,10 @@ def choose(args: argparse.Namespace, cfg):
                 "0): start from one that has, such as --init mini, or from scratch."
             )
         recipe = [stage for stage in recipe if not stage.lookup]
-    if args.stage == "all":
-        chosen = recipe
-    elif args.stage in ("lora", "hires"):
-        chosen = [stages_.lora_stage(200, frames=cfg.frames, hires=args.stage == "hires")]
-        if count(model.specs(cfg)) < plan.LARGE:
-            chosen = [stages_.for_one_scene(chosen[0])]
-    else:
-        chosen = [stages_.find_stage(recipe, args.stage)]
-    if args.stage == "hires" or args.size:
-        cfg = resize(cfg, args.size)
+    chosen = recipe if args.stage == "all" else [stages_.find_stage(recipe, args.stage)]
     changes = {"steps": args.steps, "batch": args.batch}
     changes = {k: v for k, v in changes.items() if v}
-    changes["remat"] = args.remat or plan.default_remat(cfg)
+    changes["remat"] = args.remat or estimate.default_remat(cfg)
     chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
     if args.lr:
         chosen = [
@@ -210,7 +215,7 @@ def dry_run(args: argparse.Namespace) -> str:
     from .core import sharding
     from .core.params import count
     from .errors import UserError
-    from .training import plan
+    from .training import estimate, loop
 
     init = starting_point(args)
     cfg = config.preset(args.preset)
@@ -218,7 +223,7 @@ def dry_run(args: argparse.Namespace) -> str:
         preset, cfg = cfg, checkpoint.load_config(checkpoint.find_model(init))
         check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
-    large = count(model.specs(cfg)) > plan.LARGE
+    large = count(model.specs(cfg)) > estimate.LARGE
     dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     if args.devices:
@@ -232,20 +237,26 @@ def dry_run(args: argparse.Namespace) -> str:
                 f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
             )
         if mesh is not None:
-            check_batch(stage.batch, mesh)
-        found = plan.plan(
-            cfg, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
+            loop.check_batch(stage.batch, mesh)
+        sized = stage_size(args, stage, cfg)
+        found = estimate.estimate(
+            sized, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
         )
-        texts.append(plan.report(found, cfg, stage, m=m, mesh=mesh, dtype=dtype))
+        texts.append(estimate.report(found, sized, stage, m=m, mesh=mesh, dtype=dtype))
     return "\n\n".join(texts)
 
 
+def stage_size(args: argparse.Namespace, stage, cfg):
+    """The configuration in a stage: `hires` doubles the size within 'all'; alone, `choose` has set it."""
+    return resize(cfg, None) if args.stage == "all" and stage.name == "hires" else cfg
+
+
 def resize(cfg, size: str | None):
-    """The configuration at another size, of generation and reconstruction alike."""
+    """The configuration at another size (None: twice its own), of generation and reconstruction alike."""
     from .errors import UserError
 
     if size is None:
-        height, width = (round(1.5 * x / 16) * 16 for x in (cfg.height, cfg.width))
+        height, width = 2 * cfg.height, 2 * cfg.width
     else:
         try:
             height, width = (int(x) for x in size.lower().split("x"))
@@ -285,20 +296,8 @@ def in_precision(frozen, dtype: str):
         )
 
 
-def check_batch(batch: int, mesh) -> None:
-    """Raise UserError if the mesh cannot split a batch of this size."""
-    from .errors import UserError
-
-    data = mesh.shape["data"]
-    if batch % data:
-        raise UserError(
-            f"A batch of {batch} cannot be split over data={data}: use --batch {max(data, batch // data * data)}, or "
-            f"--mesh with a data that divides {batch}."
-        )
-
-
-def run_stage(args, stage, params, cfg, mesh=None):
-    """Train one stage and save its model; returns (params, config) for the next."""
+def run_stage(args, stage, params, cfg, mesh, base: str):
+    """Train one stage on the model named `base` and save its model; returns (params, config) for the next."""
     import jax
 
     from . import checkpoint, model
@@ -307,33 +306,39 @@ def run_stage(args, stage, params, cfg, mesh=None):
     from .core.params import count, flatten, unflatten
     from .core.params import init as init_specs
     from .cost import keeps_float32
-    from .data.source import open_source
-    from .training import loop, stages
+    from .training import loop, stages, start
 
     out = args.out / stage.name
-    done = out / "model" / "config.json"
-    if args.resume and args.stage == "all" and done.exists():
-        print(f"{stage.name}: already trained, {done.parent}")
-        return checkpoint.load_model(done.parent)
+    say = print if distributed.is_main() else (lambda *_: None)
+    dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+    done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
+    told = []
+    if distributed.is_main():
+        begun = done or any((out / "checkpoints").glob("[0-9]*"))
+        told = start.hold_settings(
+            out,
+            stage,
+            params,
+            cfg,
+            seed=args.seed,
+            frozen_dtype=dtype,
+            start=base,
+            pool=args.data,
+            begun=begun,
+            resume=args.resume,
+        )
+    if done:
+        say(f"{stage.name}: already trained, {out / 'model'}")
+        with on_host():
+            return checkpoint.load_model(out / "model")
+    for line in told:
+        say(line)
     if mesh is not None:
-        check_batch(stage.batch, mesh)
+        loop.check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
     working = stages.stage_config(cfg, stage)
-    if distributed.is_main():
-        settings = {
-            "model": cfg.name,
-            "size": f"{working.height}x{working.width}",
-            "batch": stage.batch,
-            "seed": args.seed,
-            "learning rate": stage.optim.learning_rate,
-            "start": Path(starting_point(args)).name,
-            "data": args.data.name if args.data else "procedural scenes",
-        }
-        begun = any((out / "checkpoints").glob("[0-9]*"))
-        keep_settings(out, settings, begun=begun, resume=args.resume)
     size = working.height, working.width
-    window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
-    source = open_source(args.data, *size, window)
+    source = start.open_data(args.data, stage, cfg)
     if stage.about_preview and cfg.fusion.preview and cfg.fusion.preview_std is None:
         params, cfg = stages.measure_preview(params, source, cfg, args.seed)
         working = stages.stage_config(cfg, stage)
@@ -344,17 +349,16 @@ def run_stage(args, stage, params, cfg, mesh=None):
         added = stages.new_leaves(cfg, stage)
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
     frozen = stages.read(frozen, stage)
-    dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
     if dtype != "float32":
         frozen = in_precision(frozen, dtype)
     if mesh is not None:  # now, so that no device ever holds all of it twice
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
-    say = print if distributed.is_main() else (lambda *_: None)
-    if args.show_mesh and mesh is not None:
+    if args.show_mesh:
+        shown = sharding.abstract_mesh() if mesh is None else mesh
         kept = sharding.describe(
-            frozen_specs, mesh, lambda path: "float32" if keeps_float32(path) else dtype
+            frozen_specs, shown, lambda path: "float32" if keeps_float32(path) else dtype
         )
-        say(f"trains: {sharding.describe(specs, mesh)}\nfrozen: {kept}")
+        say(f"trains: {sharding.describe(specs, shown)}\nfrozen: {kept}")
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
     say(
         f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
@@ -374,28 +378,32 @@ def run_stage(args, stage, params, cfg, mesh=None):
         from .training.diagnose import joint_diagnose
 
         diagnose = joint_diagnose(working)
-    state = loop.train(
-        objective,
-        trainable,
-        frozen,
-        specs,
-        lambda i: stages.stage_batch(source, stage, working, args.seed, i, rows),
-        optim=stage.optim,
-        loop=loop.LoopConfig(
-            steps=stage.steps, seed=args.seed, log_every=args.log_every, save_every=args.save_every
-        ),
-        out=out,
-        resume=args.resume,
-        mesh=mesh,
-        frozen_specs=frozen_specs,
-        batch=stage.batch,
-        name=stage.name,
-        evaluate=evaluate,
-        evaluate_every=args.evaluate_every,
-        diagnose=diagnose,
-        diagnose_every=args.diagnose_every,
-        writer=writer,
-    )
+    with contextlib.closing(writer) if writer else contextlib.nullcontext():
+        state = loop.train(
+            objective,
+            trainable,
+            frozen,
+            specs,
+            lambda i: stages.stage_batch(source, stage, working, args.seed, i, rows),
+            optim=stage.optim,
+            loop=loop.LoopConfig(
+                steps=stage.steps,
+                seed=args.seed,
+                log_every=args.log_every,
+                save_every=args.save_every,
+            ),
+            out=out,
+            resume=args.resume,
+            mesh=mesh,
+            frozen_specs=frozen_specs,
+            batch=stage.batch,
+            name=stage.name,
+            evaluate=evaluate,
+            evaluate_every=args.evaluate_every,
+            diagnose=diagnose,
+            diagnose_every=args.diagnose_every,
+            writer=writer,
+        )
     learned = state.get("ema", state["params"])
     learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
@@ -419,8 +427,8 @@ def run_stage(args, stage, params, cfg, mesh=None):
             out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
         )
         if stage.lora:
-            base = {"base": args.init or args.preset, "data": str(args.data or "procedural scenes")}
-            checkpoint.save_adapter(out / "adapter", learned, cfg, provenance | base)
+            provenance |= {"base": base, "data": str(args.data or "procedural scenes")}
+            checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
         print(f"{stage.name}: saved {out / 'model'}{change}")
     return params, cfg

@@ -1,12 +1,17 @@
 """The pages keep up with the code: links and anchors lead somewhere, commands and options exist, charts are listed."""
 
+import argparse
+import inspect
+import json
 import re
 import shlex
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from roge_jax import check, convert, entry, evaluate, export, sample, train
+from roge_jax.data import pack, pool, procedural
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -71,16 +76,69 @@ def test_files_named_in_the_text_exist(page):
     assert not set(faults) - expected, faults
 
 
+def parser_of(module, monkeypatch) -> argparse.ArgumentParser:
+    """The options of a program, also of one that makes its parser on the way."""
+    if hasattr(module, "parser"):
+        return module.parser()
+    found = []
+    monkeypatch.setattr(module, "execute", lambda run, parser, arguments: found.append(parser) or 0)
+    assert module.main([]) == 0
+    return found[0]
+
+
+def options(parser: argparse.ArgumentParser) -> list[str]:
+    """The longest name of every option, those of subcommands too."""
+    found = []
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            found += [name for one in action.choices.values() for name in options(one)]
+        elif action.option_strings and "--help" not in action.option_strings:
+            found.append(action.option_strings[-1])
+    return found
+
+
 @pytest.mark.parametrize(
     ("module", "pages"),
-    [(sample, ["sampling"]), (train, ["training", "scaling"]), (evaluate, ["metrics"])],
-    ids=["sample", "train", "evaluate"],
+    [
+        (sample, ["sampling"]),
+        (train, ["training", "scaling"]),
+        (evaluate, ["metrics"]),
+        (convert, ["weights"]),
+        (export, ["weights"]),
+        (check, ["own_photos"]),
+        (pack, ["own_photos"]),
+        (pool, ["figures"]),  # python -m roge_jax.data.procedural
+    ],
+    ids=lambda x: x.__name__.rpartition(".")[2] if inspect.ismodule(x) else "",
 )
-def test_every_option_is_explained(module, pages):
+def test_every_option_is_explained(module, pages, monkeypatch):
     text = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in pages)
-    options = [a.option_strings[-1] for a in module.parser()._actions if a.option_strings]
-    missing = [name for name in options if name != "--help" and f"`{name}`" not in text]
-    assert not missing, missing
+    names = options(parser_of(module, monkeypatch))
+    missing = [name for name in names if f"`{name}`" not in text]
+    assert len(names) > 4 and not missing, missing
+
+
+def test_the_renderers_benchmark_prints_what_its_page_says(monkeypatch, capsys):
+    """24 frames each half a second for five seconds; the first call, which compiles, does not count."""
+    clock, cpu, seeds = [0.0], [0.0], []
+    real = inspect.signature(procedural.sample_sequence)
+
+    def render(*seed, **options):
+        assert real.bind(*seed, **options).arguments["frames"] == 24
+        clock[0] += 0.5 if seeds else 60.0
+        cpu[0] += 0.25 if seeds else 50.0
+        seeds.extend(seed)
+
+    monkeypatch.setattr(procedural, "sample_sequence", render)
+    fake = SimpleNamespace(perf_counter=lambda: clock[0], process_time=lambda: cpu[0])
+    monkeypatch.setattr(pool, "time", fake)
+    assert pool.main(["bench"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    rates = printed["first_call_seconds"], printed["frames_per_second"]
+    assert rates == (60.0, 48.0) and printed["frames_per_cpu_second"] == 96.0
+    text = (ROOT / "docs" / "figures.md").read_text()
+    assert "roge_jax.data.procedural bench" in text
+    assert [name for name in printed if f"`{name}`" not in text] == []
 
 
 def test_every_chart_and_experiment_can_be_made_again():

@@ -402,17 +402,37 @@ def test_world_frame_of_the_scene(seed):
     )
 
 
-def test_order_of_contexts():
-    """With the first view fixed the others permute: same divisor, permuted rays and slots; another
-    first view changes the frame by one rigid motion, not the divisor's rule."""
-    every = some(6)
-    order = [0, 2, 3, 1]
-    swapped = Cameras(every.K[[*order, 4, 5]], every.c2w[[*order, 4, 5]])
-    vector, rays, _ = network_inputs(every[:4], every[4:])
-    other_vector, other_rays, _ = network_inputs(swapped[:4], swapped[4:])
+@few
+@given(seeds, st.permutations([1, 2, 3, 4]))
+def test_order_of_contexts(seed, rest):
+    """With the first view fixed contexts 2..M permute: same divisor, permuted rays and slots, targets bit for bit."""
+    every = some(7, seed)
+    order = [0, *rest]
+    swapped = every[[*order, 5, 6]]
+    vector, rays, status = network_inputs(every[:5], every[5:])
+    other_vector, other_rays, other_status = network_inputs(swapped[:5], swapped[5:])
+    assert status == other_status == "ok"
     np.testing.assert_array_equal(other_vector, vector[order])
-    np.testing.assert_array_equal(other_rays[:4], rays[:4][order])
-    np.testing.assert_array_equal(other_rays[4:], rays[4:])
-    slots, other_slots = pack_views(rays[:5], 4), pack_views(other_rays[:5], 4)
-    np.testing.assert_array_equal(other_slots[:4], slots[:4][order])
-    np.testing.assert_array_equal(other_slots[4], slots[4])
+    np.testing.assert_array_equal(other_rays[:5], rays[:5][order])
+    np.testing.assert_array_equal(other_rays[5:], rays[5:])
+    slots, other_slots = pack_views(rays[:6], 5), pack_views(other_rays[:6], 5)
+    np.testing.assert_array_equal(other_slots[:5], slots[:5][order])
+    np.testing.assert_array_equal(other_slots[5], slots[5])
+    assert np.abs(rays[1] - rays[2]).max() > 1e-3  # the views differ: an order can be seen
+
+
+@few
+@given(seeds, st.integers(1, 4))
+def test_another_first_context(seed, first):
+    """It moves the world by one rigid motion and keeps the divisor's rule: its own largest distance to a context."""
+    every = some(7, seed)
+    order = [first, *(i for i in range(5) if i != first)]
+    _, target, info = normalise(every[:5], every[5:])
+    _, other, moved_info = normalise(every[order], every[5:])
+    relative = other.c2w @ np.linalg.inv(target.c2w)
+    ratio = info.divisor / moved_info.divisor
+    for motion in relative:
+        np.testing.assert_allclose(motion[:3, :3], relative[0, :3, :3], atol=1e-6)
+    steps = [np.diff(c.centres, axis=0) for c in (target, other)]
+    expected = ratio * steps[0] @ relative[0, :3, :3].T
+    np.testing.assert_allclose(steps[1], expected, atol=1e-5)

@@ -30,10 +30,11 @@ ALLOWED = {
     "weights": _PARTS,
     "data": _BASE | {"entry", "folders"},  # neither networks nor metrics; a program writes pools
     "metrics": _BASE,
-    "checkpoint": _PARTS | {"model", "weights"},
+    "checkpoint": _PARTS | {"model", "weights", "folders"},
     "cost": _PARTS | {"model"},
     "limits": _BASE,
-    "training": _PARTS | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost"},
+    "training": _PARTS
+    | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost", "folders"},
     "windows": _PARTS | {"model"},
     "programs": _PARTS | {"model"},
     "sampling": _PARTS | {"model", "data", "programs", "windows", "limits"},

@@ -120,6 +120,58 @@ def test_reference_meets_the_exact_flow(stepper):
         assert float(jnp.linalg.norm(found.x0 - exact) / jnp.linalg.norm(exact)) <= found.self_error
 
 
+def test_conditional_flow_is_the_posterior_and_the_reference_of_its_field():
+    matrix, observed, noise = np.array([[1.0, 0.5, 0.0], [0.0, -1.0, 0.7]]), [0.8, -0.3], 0.2
+    # the posterior by Kalman's gain, which the test-bed does not use
+    gain = matrix.T @ np.linalg.inv(matrix @ matrix.T + noise**2 * np.eye(2))
+    covariance = np.eye(3) - gain @ matrix
+    with jax.enable_x64(True):
+        problem = testbed.conditional(matrix, observed, noise)
+        # x1 ~ N(0, I) is mapped to mean + A x1 with A A^T = covariance
+        np.testing.assert_allclose(problem.exact(jnp.zeros(3)), gain @ observed, atol=1e-12)
+        linear = jax.jacobian(problem.exact)(jnp.zeros(3))
+        np.testing.assert_allclose(linear @ linear.T, covariance, atol=1e-12)
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(2, 3)))
+        found = reference_solution(problem.velocity, x1, stepper="picard", tolerance=1e-8)
+        gap = jnp.linalg.norm(found.x0 - problem.exact(x1)) / jnp.linalg.norm(found.x0)
+        assert float(gap) <= found.self_error <= 1e-8
+
+
+POINTS = np.array([[1.0, 0.2], [-0.8, 0.9], [-0.1, -1.1]])
+
+
+def test_empirical_field_is_the_mean_velocity_towards_the_data():
+    """v = (x - E[x0 | x]) / sigma with E[x0 | x] by summing over points and a quadrature of each point's blur."""
+    std, sigma, x = 0.3, 0.6, np.array([0.4, -0.2])
+    nodes_1d, weights_1d = np.polynomial.hermite_e.hermegauss(40)
+    offset = np.stack(np.meshgrid(nodes_1d, nodes_1d), -1).reshape(-1, 2) * std
+    x0 = POINTS[:, None] + offset  # [k, q, 2]
+    prior = np.outer(weights_1d, weights_1d).ravel()
+    likelihood = prior * np.exp(-0.5 * np.sum((x - (1 - sigma) * x0) ** 2, -1) / sigma**2)
+    mean = np.einsum("kq,kqd->d", likelihood, x0) / likelihood.sum()
+    with jax.enable_x64(True):
+        field = testbed.empirical(POINTS, std).velocity(jnp.asarray(x), jnp.float64(sigma))
+        np.testing.assert_allclose(field, (x - mean) / sigma, rtol=1e-9)
+
+
+def test_empirical_flow_keeps_quantiles_on_a_line_and_memorises_in_the_plane():
+    std = 0.02
+    with jax.enable_x64(True):
+        line = testbed.empirical(np.array([[-1.0], [0.1], [0.9]]), 0.3)
+        x1 = jnp.linspace(-2.0, 2.0, 5)[:, None]
+        found = reference_solution(line.velocity, x1, stepper="picard", tolerance=1e-8)
+        gap = jnp.linalg.norm(found.x0 - line.exact(x1)) / jnp.linalg.norm(found.x0)
+        assert float(gap) <= found.self_error <= 1e-8
+        plane = testbed.empirical(POINTS, std)
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(16, 2)))
+        grid = flow.schedule("graded", 48, power=3)
+        x0, report = integrate(plane.velocity, x1, grid, stages=4, stepper="picard")
+        assert int(report["failed"]) == 0
+        distance = np.linalg.norm(np.asarray(x0)[:, None] - POINTS, axis=-1)  # [n, k]
+        assert distance.min(1).max() < 4 * std
+        assert set(distance.argmin(1)) == {0, 1, 2}
+
+
 def test_matrix_free_newton_equals_dense_newton_and_picard():
     with jax.enable_x64(True):
         x1 = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4)))

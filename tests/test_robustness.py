@@ -158,6 +158,23 @@ def test_other_measures():
     assert np.isnan(limits.sharpness(np.full((1, 32, 32, 3), 0.3))).all()
 
 
+@pytest.mark.parametrize("sigma", [0.01, 0.03, 0.1])
+def test_noise_is_told_from_fine_detail(sigma):
+    """A flat photo gives the dose, a textured one as well, and nothing without noise, however fine its detail."""
+    rng = np.random.default_rng(1)
+    flat = perturb.add_noise(np.full((1, 64, 112, 3), 0.5, np.float32), sigma, rng)
+    assert limits.noise(flat)[0] == pytest.approx(sigma, rel=0.05)
+    gravel = rng.uniform(-0.2, 0.2, (2, 64, 112, 1))  # the finest detail there is, of brightness
+    colours = rng.uniform(0.4, 0.6, (2, 4, 7, 3)).repeat(16, 1).repeat(16, 2)
+    clean = (colours + gravel).astype(np.float32)
+    assert limits.noise(clean).max() < 1e-6
+    noisy = perturb.add_noise(clean, sigma, rng)
+    # Edges of colours hide a little under the median: an eighth of the places here.
+    np.testing.assert_allclose(limits.noise(noisy), sigma, rtol=0.3)
+    one = np.concatenate([noisy[:1], clean[1:]])
+    assert limits.noise(one)[0] > 100 * limits.noise(one)[1]  # photo by photo
+
+
 # Warnings.
 
 LIMITS = {
@@ -167,6 +184,7 @@ LIMITS = {
     "photos": {"limit": 2.4, "broke": True},
     "exposure": {"limit": 1.5, "broke": True},
     "blur": {"limit": 0.4, "broke": True},
+    "noise": {"limit": 0.1, "broke": True, "moved": True},
 }
 SEEN = at([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
@@ -182,6 +200,7 @@ CASES = {
     "photos": (SEEN[np.array([0, 1, 0])], at([[0, 0, 0]]), sharp_photos(), "14 repeats 10"),
     "exposure": (SEEN, at([[0, 0, 0]]), perturb.expose(sharp_photos(), np.array([-2.0, 0, 0])), "brighter than photo 10"),
     "blur": (SEEN, at([[0, 0, 0]]), np.concatenate([sharp_photos(2), perturb.blur(sharp_photos(1), 3.0)]), "photo 14 is blurred"),
+    "noise": (SEEN, at([[0, 0, 0]]), np.concatenate([sharp_photos(2), perturb.add_noise(sharp_photos(1), 0.2, np.random.default_rng(0))]), "photo 14 is noisy"),
 }  # fmt: skip
 
 
@@ -209,6 +228,7 @@ def test_shipped_limits_say_where_they_come_from():
     assert set(limits.table("mini")) == set(LIMITS)
     for kind, one in row["limits"].items():
         assert np.isfinite(one["limit"]) and isinstance(one["broke"], bool), kind
+        assert one["undisturbed_beyond"] <= 0.05 and one["last_level_beyond"] >= 0.95, kind
     assert limits.table("tiny") == {}
 
 
@@ -243,6 +263,24 @@ def test_the_program_warns_once_and_records_it(tmp_path, monkeypatch, capsys):
     assert said[0] == f"warning: {record[0]['message']}"
     assert record[0]["value"] > record[0]["limit"] == 0.5
     assert run(1e3) == ([], [])
+
+
+def test_photos_from_one_place_are_no_error_but_said(tmp_path, monkeypatch, capsys):
+    """A tripod's photos: the program ends well, names what is missing once, and records what it took in its place."""
+    config = preset("tiny")
+    checkpoint.save_model(tmp_path / "model", model.init(jax.random.key(0), config), config)
+    cameras = truth(3)
+    cameras.c2w[:, :3, 3] = cameras.c2w[0, :3, 3]
+    nerfstudio(tmp_path / "scene", cameras)
+    monkeypatch.setattr(programs, "for_window", without_network)
+    words = ["--checkpoint", tmp_path / "model", "--scene", tmp_path / "scene", "--steps", 1]
+    for path in ("orbit", "pan"):  # pan: the path gives no scale either
+        more = ["--trajectory", path, "--frames", 3, "--out", tmp_path / path]
+        assert entry.execute(sample.main, sample.parser(), [str(w) for w in words + more]) == 0
+        said = [x for x in capsys.readouterr().err.splitlines() if x.startswith("warning: ")]
+        assert len(said) == 1 and "fix no scale" in said[0], said
+        scale = json.loads((tmp_path / path / "run.json").read_text())["scale"]
+        assert scale["status"] == "coincident_centres" and scale["divisor"] > 0
 
 
 def test_warnings_have_their_own_category():
@@ -295,3 +333,24 @@ def test_break_of_a_known_curve_and_its_interval(report, direction):
     assert low < 1 / slopes.mean() < high and found["share_crossing"] == 1.0
     never = report.with_interval(direction * steps, np.ones((6, 12)), False)
     assert never["at"] is None and never["interval"] == [None, None]
+
+
+def test_limits_on_estimates_lie_outside_the_undisturbed_scenes(report):
+    """A break that 5 % of the undisturbed scenes pass moves to their 95 % quantile, above as below; others stay."""
+    found, broken = {}, {}
+    for kind, measured in report.SHOWN.items():
+        levels = [report.KNOBS[kind].still, *report.KNOBS[kind].levels]
+        values = [1.0 - 0.1 * i if measured == "sharpness" else 0.1 * i for i in range(len(levels))]
+        found[kind] = {"levels": levels, "seen": {measured: [[x] * 4 for x in values]}}
+        end = {"at": levels[1], "interval": [None, None]}
+        broken[kind] = {method: {"loses_1_db": end} for method in report.MODELS}
+    usual = np.linspace(0.0, 0.2, 101)  # 95 % within 0.19; the breaks are at 0.1 and 0.9
+    still = {"exposure_stops": usual, "sharpness": 1.0 - usual, "noise": 0.1 * usual}
+    rows = report.limit_rows(found, broken, still)
+    moved = {kind: row["limit"] for kind, row in rows.items() if row["moved"]}
+    assert moved == {"exposure": pytest.approx(0.19), "blur": pytest.approx(0.81)}
+    for kind, row in rows.items():
+        assert row["undisturbed_beyond"] <= 0.05, kind
+        expected = 0.9 if kind == "blur" else 0.1
+        assert row["measured_limit"] == pytest.approx(expected), kind
+    assert rows["noise"]["limit"] == rows["noise"]["measured_limit"]

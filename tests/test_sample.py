@@ -371,7 +371,7 @@ def test_defaults_are_the_contract():
     ],
 )
 def test_context_words(text, ids, place):
-    assert sample.context_ids(text, load_scene(place / "scene"), 9) == ids
+    assert sampling.context_ids(text, load_scene(place / "scene"), 9) == ids
 
 
 def test_field_of_view_and_size(place, photos):
@@ -506,6 +506,13 @@ BAD = {
         ["--schedule", "optimised", "--steps", "777"],
         "No optimised schedule",
     ),
+    "too many frames": (["--frames", "10001"], "--frames 10001: give a path of at most 10000"),
+    "unknown axis of a mesh": (["--mesh", "nonsense=3"], "unknown axis 'nonsense'"),
+    "mesh over scenes": (["--mesh", "data=2"], "one video has no scenes to split"),
+    "mesh that does not divide": (["--mesh", "fsdp=3"], "cannot be split over fsdp=3"),
+    "mesh of other devices": (["--mesh", "fsdp=2", "--devices", "3"], "does not make 3 devices"),
+    "budget below any plan": (["--max-cost", "1"], "max_cost 1 FLOPs is less than the cheapest"),
+    "negative tolerance": (["--tolerance=-1"], "'-1' is not a number of at least 0"),
 }
 
 
@@ -523,18 +530,86 @@ def test_bad_options_are_refused_in_one_sentence(case, place, capsys):
     expect_refusal(program(place, *words, out="bad"), said, place, capsys)
 
 
+@pytest.mark.parametrize("case", sorted(BAD.keys() - {"preset without weights"}))
+def test_dry_runs_refuse_the_same(case, place, capsys):
+    """With the same words as the run, all that needs no weights."""
+    words, said = BAD[case]
+    code = program(place, *words, out="bad")
+    expected = capsys.readouterr().err
+    assert (program(place, "--dry-run", *words, out="bad"), code) == (2, 2)
+    assert capsys.readouterr().err == expected and said in expected
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--trajectory", "orbti"], "did you mean 'orbit'?"),
-        (["--trajectory", "orbit:degrees=wide"], "'degrees' is 'wide'"),
         (["--scene", "procedural:abc"], "whole number"),
-        (["--fov", "500"], "between 0 and 180"),
-        (["--size", "0x0"], "must be multiples of 16"),
+        (["--scene", "procedural:-3"], "seed -3"),
+        (["--scene", "procedural:3", "--context", "0,40"], "there is no photo 40"),
+        (["--scene", "motorcycle", "--context", "10"], "--context 10: give 1 to 2"),
     ],
 )
-def test_dry_runs_refuse_the_same(words, said, place, capsys):
+def test_dry_runs_refuse_what_built_in_scenes_do_not_have(words, said, place, capsys):
     expect_refusal(program(place, "--dry-run", *words, out="bad"), said, place, capsys)
+
+
+def test_dry_runs_check_photos_and_weights_alone_are_not_read(place, capsys, tmp_path):
+    import shutil
+
+    scene = nerfstudio(tmp_path / "scene", truth(2))
+    file = scene / "images" / "0001.png"
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    expect_refusal(program(place, "--dry-run", "--scene", scene), "0001.png", place, capsys)
+    file.write_bytes(whole)
+    shutil.copytree(place / "model", tmp_path / "model")
+    next((tmp_path / "model").glob("*.safetensors")).write_bytes(b"torn")
+    words = ["--checkpoint", tmp_path / "model", "--scene", scene]
+    assert program(place, "--dry-run", *words) == 0
+
+
+def test_a_dry_run_prints_the_plan_and_the_full_cost(place, capsys):
+    def shown(*words):
+        assert program(place, "--dry-run", "--frames", 12, *words, out="dry") == 0
+        return capsys.readouterr().out
+
+    full = shown()
+    assert "plan for" not in full
+    for words in (("--tolerance", 0.5), ("--max-cost", 1e15)):
+        text = shown(*words)
+        assert text.startswith(full.rstrip()) and "the full model's cost, the most" in text
+        assert "for an average scene" in text and "0 kFLOP for planning" in text
+    assert "(100 %)" not in shown("--tolerance", 0.5) and "(100 %)" in shown("--tolerance", 0)
+    assert not (place / "dry").exists()
+
+
+def test_a_dry_run_counts_all_devices_of_a_mesh(place, capsys):
+    assert program(place, "--dry-run", "--mesh", "fsdp=2,seq=2") == 0
+    assert "all 4 devices together" in capsys.readouterr().out
+
+
+def test_a_dry_run_of_more_photos_than_the_built_in_scene_has_says_so(place, capsys):
+    assert program(place, "--dry-run", "--scene", "motorcycle", "--context", 4) == 0
+    shown = capsys.readouterr().out
+    assert "photos    4" in shown and "none was read" in shown
+    assert program(place, "--dry-run", "--scene", "motorcycle", "--context", 2) == 0
+    assert "none was read" not in capsys.readouterr().out
+
+
+def test_no_path_is_built_that_is_too_long(place, capsys, tmp_path, monkeypatch):
+    """A count that would fill the memory is refused before anything of that length exists."""
+    from roge_jax.geometry import trajectories
+
+    monkeypatch.setattr(trajectories, "make_path", lambda *a, **k: pytest.fail("a path was built"))
+    for words in ([], ["--dry-run"]):
+        code = program(place, *words, "--frames", 100_000_000, out="bad")
+        expect_refusal(code, "at most 10000 frames", place, capsys)
+    monkeypatch.undo()
+    pose = np.eye(4).tolist()
+    keys = {"convention": "opencv", "keyframes": [{"pose": pose}, {"pose": pose}], "count": 10001}
+    (tmp_path / "long.json").write_text(json.dumps(keys))
+    code = program(place, "--trajectory", tmp_path / "long.json", out="bad")
+    expect_refusal(code, "long.json: give a path of at most 10000", place, capsys)
 
 
 def test_a_dry_run_counts_the_frames_of_a_path_file(place, photos, capsys, tmp_path):
@@ -636,6 +711,8 @@ def test_wrong_arguments_from_python_are_named(weights, photos):
 
 
 NAN_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, float("nan")], [0, 0, 0, 1]]
+SHEARED = [[1, 0.3, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+SCALED = [[2.5, 0, 0, 1], [0, 2.5, 0, 0], [0, 0, 2.5, 0], [0, 0, 0, 1]]
 MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 
 
@@ -645,6 +722,8 @@ MIRROR = [[-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ({"file_path": "images/gone.png"}, "gone.png"),
         ({"transform_matrix": NAN_POSE}, "0001"),
         ({"transform_matrix": MIRROR}, "mirror"),
+        ({"transform_matrix": SHEARED}, "R is no rotation"),
+        ({"transform_matrix": SCALED}, "scale of 2.5; divide"),
         ({"fl_x": -5.0}, "0001"),
         ({"w": 80, "h": 24}, "intrinsics are for"),
     ],

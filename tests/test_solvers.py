@@ -82,36 +82,49 @@ def test_states_kept_by_solve_are_those_of_each_step():
 
 
 WHOLE, INNER = (1.0, 0.0), (0.98, 0.02)
+PARTS = (slice(0, 1), slice(1, 4), slice(4, 12), slice(12, 14))  # coordinates of each flow
 
 
 @pytest.fixture(scope="module")
-def two_flows():
-    """A 1-D mixture with its exact quantile map beside an 8-D one with the implicit reference."""
+def flows():
+    """A 1-D mixture and a linear-Gaussian posterior with their exact maps, an 8-D mixture and a data set in the plane with
+    the implicit reference, side by side: (velocity, x1 [16, 14], {interval: truth}, {interval: self-error}).
+    """
     with jax.enable_x64(True):
-        line = testbed.mixture([0.3, 0.7], [[-1.0], [0.8]], [0.5, 0.6])
-        space = testbed.random_mixture(8, 4, 0.5)
-        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(16, 9)))
+        problems = (
+            testbed.mixture([0.3, 0.7], [[-1.0], [0.8]], [0.5, 0.6]),
+            testbed.conditional([[1.0, 0.5, 0.0], [0.0, -1.0, 0.7]], [0.8, -0.3], 0.5),
+            testbed.random_mixture(8, 4, 0.5),
+            testbed.empirical(np.array([[1.0, 0.2], [-0.8, 0.9], [-0.1, -1.1]]), 0.5),
+        )
+        assert [p.dim for p in problems] == [part.stop - part.start for part in PARTS]
+
+        def beside(problems):
+            ends = np.cumsum([p.dim for p in problems])[:-1]
+
+            def velocity(x, sigma):
+                parts = jnp.split(x, ends, axis=-1)
+                return jnp.concatenate([p.velocity(y, sigma) for p, y in zip(problems, parts)], -1)
+
+            return velocity
+
+        known = PARTS[2].start
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(16, PARTS[-1].stop)))
         truth, self_error = {}, {}
         for start, end in (WHOLE, INNER):
+            exact = [p.exact(x1[:, part], start, end) for p, part in zip(problems[:2], PARTS)]
             found = reference_solution(
-                space.velocity,
-                x1[:, 1:],
+                beside(problems[2:]),
+                x1[:, known:],
                 sigmas=schedule("graded", 48, power=3) * (start - end) + end,
                 stepper="picard",
                 tolerance=1e-9,
                 steps=48,
                 doublings=1,
             )
-            exact = line.exact(x1[:, :1], start, end)
-            truth[start, end] = np.concatenate([exact, found.x0], 1)
+            truth[start, end] = np.concatenate([*exact, found.x0], 1)
             self_error[start, end] = found.self_error * np.linalg.norm(found.x0)
-
-        @jax.jit
-        def velocity(x, sigma):
-            parts = (line.velocity(x[:, :1], sigma), space.velocity(x[:, 1:], sigma))
-            return jnp.concatenate(parts, -1)
-
-        return velocity, x1, truth, self_error
+        return jax.jit(beside(problems)), x1, truth, self_error
 
 
 @pytest.mark.parametrize(
@@ -121,23 +134,27 @@ def two_flows():
     # a factor log N to the error, log2(ln 256 / ln 128) = 0.19 of observed order
     + [("dpmpp_2m", INNER, 0.0), ("dpmpp_2m", WHOLE, 0.2)],
 )
-def test_observed_order_against_exact_flow_and_reference(name, interval, lost, two_flows):
-    velocity, x1, truth, self_error = two_flows
+def test_observed_order_against_exact_flow_and_reference(name, interval, lost, flows):
+    velocity, x1, truth, self_error = flows
     coarse = {"rk4": 64, "rkc2": 64, "rkc2_8": 64}.get(name, 128)
     errors = []
     with jax.enable_x64(True):
         for steps in (coarse, 2 * coarse):
             gap = run(name, velocity, x1, np.linspace(*interval, steps + 1)) - truth[interval]
-            errors.append([np.linalg.norm(gap[:, :1]), np.linalg.norm(gap[:, 1:])])
-    assert errors[1][1] > 10 * self_error[interval]
+            errors.append([np.linalg.norm(gap[:, part]) for part in PARTS])
+    assert min(errors[1][2:]) > 10 * self_error[interval]
     observed = np.log2(np.array(errors[0]) / np.array(errors[1]))
-    order = SOLVERS[name].order
+    order = np.full(len(PARTS), SOLVERS[name].order)
+    if (
+        name == "midpoint"
+    ):  # on a Gaussian r'' ~ r^-3 along x = r(sigma): its r'''/24 + (r'/r) r''/8 is zero
+        order[1] += 1
     print(name, interval, observed)
     assert np.all(observed > order - lost - 0.3) and np.all(observed < order + 0.6), observed
 
 
-def test_adaptive_error_follows_its_tolerance(two_flows):
-    velocity, x1, truth, _ = two_flows
+def test_adaptive_error_follows_its_tolerance(flows):
+    velocity, x1, truth, _ = flows
     grid = np.array([1.0, 0.9, 1e-4, 0.0])
     with jax.enable_x64(True):
         adapt = jax.jit(

@@ -2,22 +2,25 @@
 
 import dataclasses
 import functools
+import itertools
 import json
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from test_sharding import small
 
 from roge_jax import config, entry, model, train
-from roge_jax.checkpoint import load_model, save_model
+from roge_jax.checkpoint import load_model, model_fingerprint, save_model
 from roge_jax.core.params import flatten
 from roge_jax.data.source import open_source
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
-from roge_jax.training import loop, stages
+from roge_jax.folders import BLOCK_BYTES, BLOCKS, fingerprint
+from roge_jax.training import diagnose, loop, stages
 
 
 def run(*arguments) -> None:
@@ -42,6 +45,44 @@ def common():
         patch.setitem(config.PRESETS, "tiny", lambda: smaller)
         patch.setattr(stages, "lora_stage", two_contexts)
         yield ["tiny", "--devices", 1, "--log-every", 1, "--save-every", 1]
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Objectives that move every leaf by what the batch shows, plain steps, no measuring: quick to compile, and the
+    program, the loop and the checkpoints around them are real.
+    """
+
+    def objective(trainable, frozen, batch, key, *, config, stage):
+        level = batch["target_rgb"].mean() + 0.1 * jax.random.uniform(key)
+        loss = sum(jnp.square(x - level).sum() for x in jax.tree.leaves(trainable))
+        return loss, {"flow": loss}
+
+    monkeypatch.setattr(loop, "make_optimiser", lambda optim, specs, steps: optax.sgd(1e-3))
+    for name in stages.OBJECTIVES:
+        monkeypatch.setitem(stages.OBJECTIVES, name, objective)
+    monkeypatch.setattr(stages, "measure_latents", lambda params, source, cfg, seed: cfg)
+    monkeypatch.setattr(stages, "measure_features", lambda params, source, cfg, seed: (params, cfg))
+
+
+def write_pool(folder, size, seed=0, frames=12):
+    """Two sequences of noise [frames, height, width] that move sideways."""
+    rng, (height, width) = np.random.default_rng(seed), size
+    folder.mkdir(parents=True)
+    rgb = rng.integers(0, 256, (2, frames, height, width, 3), np.uint8)
+    np.save(folder / "shard_00000.rgb.npy", rgb)
+    c2w = np.tile(np.eye(4), (2, frames, 1, 1))
+    c2w[..., 0, 3] = 0.1 * np.arange(frames)
+    K = np.tile([[height, 0, width / 2], [0, height, height / 2], [0, 0, 1.0]], (2, frames, 1, 1))
+    np.savez(folder / "shard_00000.npz", seeds=np.arange(2), K=K, c2w=c2w)
+    return folder
+
+
+def same(a, b, prefix="") -> bool:
+    """Whether two models have the same leaves, bit for bit; of those whose path starts with `prefix`."""
+    a, b = ({p: x for p, x in flatten(t).items() if p.startswith(prefix)} for t in (a, b))
+    assert a.keys() == b.keys() and a
+    return all(np.array_equal(a[path], b[path]) for path in a)
 
 
 def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
@@ -249,3 +290,202 @@ def test_the_preset_must_be_that_of_the_model(tmp_path):
         run("tiny", "--init", "mini", "--devices", 1, "--out", tmp_path)
     with pytest.raises(UserError, match="'mini' model and the preset is 'tiny'"):
         run("tiny", "--init", "mini", "--dry-run")
+
+
+# What a run is held to when it goes on.
+
+
+def test_another_start_or_pool_of_the_same_name_is_refused(common, cheap, tmp_path, capsys):
+    cfg = config.preset("tiny")
+    for name, seed in (("a", 0), ("b", 1)):
+        save_model(tmp_path / name / "model", model.init(jax.random.key(seed), cfg), cfg)
+        write_pool(tmp_path / name / "pool", (32, 48), seed)
+
+    def go(start, pool, *more):
+        given = ["--init", tmp_path / start / "model", "--data", tmp_path / pool / "pool"]
+        run(*common, "--out", tmp_path / "out", *given, *more)
+        return capsys.readouterr().out
+
+    assert "begun" not in go("a", "a", "--steps", 1)
+    with pytest.raises(UserError, match="holds a run with start contents"):
+        go("b", "a", "--steps", 2, "--resume")
+    with pytest.raises(UserError, match="holds a run with data contents"):
+        go("a", "b", "--steps", 2, "--resume")
+    with pytest.raises(UserError, match="frozen dtype float32, and bfloat16 is asked"):
+        go("a", "a", "--steps", 2, "--resume", "--frozen-dtype", "bfloat16")
+    (tmp_path / "a").rename(tmp_path / "moved")
+    said = go("moved", "moved", "--steps", 2, "--resume", "--remat", "full")
+    assert said.count("begun for 1 steps and continued for 2") == 1
+    assert len(losses(tmp_path / "out/lora")) == 2
+    file = tmp_path / "out/lora/settings.json"  # as runs wrote it that did not look at contents
+    held = json.loads(file.read_text())
+    lost = ("start contents", "data contents", "frozen dtype", "steps")
+    held = {name: value for name, value in held.items() if name not in lost}
+    file.write_text(json.dumps(held | {"start": "model", "data": "pool"}))
+    said = go("b", "b", "--steps", 2, "--resume")
+    assert "does not say with which frozen dtype, start contents, data contents" in said
+    with pytest.raises(UserError, match="holds a run with seed 0, and 1 is asked for"):
+        go("moved", "moved", "--steps", 2, "--resume", "--seed", 1)
+
+
+def test_a_fingerprint_tells_contents_and_nothing_else(tmp_path):
+    cfg = config.preset("tiny")
+    params = model.init(jax.random.key(0), cfg)
+    found = model_fingerprint(params, cfg)
+    for name in ("one", "two/renamed"):
+        save_model(tmp_path / name, params, cfg, dtype=jnp.float32)
+        assert model_fingerprint(*load_model(tmp_path / name)) == found
+    other = jax.tree.map(lambda x: x, params)
+    kernel = other["fusion"]["geometry_adapter"]["kernel"]
+    other["fusion"]["geometry_adapter"]["kernel"] = kernel.at[3, 1].add(1e-6)
+    flow = dataclasses.replace(cfg.flow, photometric=2 * cfg.flow.photometric)
+    others = [(other, cfg), (params, dataclasses.replace(cfg, flow=flow))]
+    assert len({found, *(model_fingerprint(*other) for other in others)}) == 3
+
+    large = np.zeros(3 * BLOCKS * BLOCK_BYTES, np.uint8)  # read in blocks
+    seen = {
+        fingerprint([("x", large)]),
+        fingerprint([("y", large)]),
+        fingerprint([("x", large[1:])]),
+    }
+    for place in (0, -1):
+        large[place] = 1
+        seen.add(fingerprint([("x", large)]))
+    assert len(seen) == 5
+
+
+# The whole recipe, and the paper's stages at its end.
+
+
+@pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_all_stages_run_and_go_on_after_an_interruption(
+    real, common, tmp_path, monkeypatch, request
+):
+    if not real:
+        request.getfixturevalue("cheap")
+    pool = write_pool(tmp_path / "pool", (64, 96))
+    options = [*common, "--stage", "all", "--data", pool, "--steps", 2, "--batch", 1]
+    run(*options, "--out", tmp_path / "whole")
+    cfg = config.preset("tiny")
+    recipe = [s.name for s in stages.mini_stages() if not s.lookup]
+    order = [*recipe, "lora", "hires"]
+    assert {p.name for p in (tmp_path / "whole").iterdir()} == set(order)
+    whole = {name: load_model(tmp_path / "whole" / name / "model") for name in order}
+    assert {c.height for name, (_, c) in whole.items() if name != "hires"} == {cfg.height}
+    assert (whole["hires"][1].height, whole["hires"][1].width) == (2 * cfg.height, 2 * cfg.width)
+    for before, after in itertools.pairwise(order):  # each goes on from the one before
+        assert not same(whole[before][0], whole[after][0])
+        held = json.loads((tmp_path / "whole" / after / "settings.json").read_text())
+        assert held["start"] == str(tmp_path / "whole" / before / "model")
+    adapter = json.loads((tmp_path / "whole/hires/adapter/config.json").read_text())
+    assert adapter["provenance"]["base"] == str(tmp_path / "whole/lora/model")
+
+    draw, trained = stages.stage_batch, []
+
+    def interrupted(source, stage, *rest):
+        if (stage.name, rest[2]) == ("lora", 1) and not trained.count("again"):
+            raise KeyboardInterrupt
+        trained.append(stage.name)
+        return draw(source, stage, *rest)
+
+    monkeypatch.setattr(stages, "stage_batch", interrupted)
+    for name in recipe:
+        shutil.copytree(tmp_path / "whole" / name, tmp_path / "again" / name)
+    with pytest.raises(KeyboardInterrupt):
+        run(*options, "--out", tmp_path / "again", "--resume")
+    assert set(trained) == {"lora"} and not (tmp_path / "again/lora/model").exists()
+    trained[:] = ["again"]
+    run(*options, "--out", tmp_path / "again", "--resume")
+    assert trained == [
+        "again",
+        "lora",
+        "hires",
+        "hires",
+    ]  # the second step of lora, and what follows
+    for name in order:
+        params, found = load_model(tmp_path / "again" / name / "model")
+        assert same(params, whole[name][0]) and found == whole[name][1], name
+    with pytest.raises(UserError, match="holds a run with seed 0, and 1 is asked for"):
+        run(*options, "--out", tmp_path / "again", "--resume", "--seed", 1)
+
+
+def test_crops_fit_into_the_pictures():
+    sides = {}
+    for name, words in (("tiny", []), ("mini", []), ("mini", ["--size", "48x64"])):
+        args = train.parser().parse_args([name, "--stage", "all", *words])
+        _, chosen = train.choose(args, config.preset(name))
+        sides[name, *words] = {stage.crop for stage in chosen if stage.crop}
+    assert list(sides.values()) == [{32}, {64}, {48}]
+
+
+def test_all_refuses_a_pool_that_its_last_stage_cannot_use_before_the_first(common, tmp_path):
+    pool = write_pool(tmp_path / "pool", (32, 48))
+    with pytest.raises(UserError, match=r"Stage hires: .* 32x48 and this stage trains at 64x96"):
+        run(*common, "--stage", "all", "--data", pool, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_hires_leaves_the_reconstruction_bit_for_bit(common, cheap, tmp_path):
+    cfg = config.preset("tiny")
+    start = model.init(jax.random.key(0), cfg)
+    save_model(tmp_path / "start", start, cfg, dtype=jnp.float32)
+    pool = write_pool(tmp_path / "pool", (64, 96))
+    given = ["--init", tmp_path / "start", "--data", pool, "--steps", 1]
+    found = {}
+    for stage, size in (("lora", []), ("hires", [])):
+        run(*common, "--stage", stage, *given, *size, "--out", tmp_path / "out")
+        found[stage], _ = load_model(tmp_path / "out" / stage / "model")
+    for part in ("encoder", "renderer"):
+        assert same(found["hires"], start, part)
+        assert not same(found["lora"], start, part)  # which the same objective moves where it may
+    assert same(found["hires"], start, "vae")
+    for part in ("dit/blocks/self_attn/q", "dit/patch_embed", "fusion"):
+        assert not same(found["hires"], start, part)
+
+
+@pytest.mark.parametrize("name", ["recon", "lora", "hires", "all"])
+def test_scale_multiplies_the_steps_of_any_stage(name):
+    def steps(*words):
+        args = train.parser().parse_args(["tiny", "--stage", name, *words])
+        return [stage.steps for stage in train.choose(args, config.preset("tiny"))[1]]
+
+    assert steps("--scale", "0.5") == [n / 2 for n in steps()]
+    assert set(steps("--scale", "1e-6")) == {1}
+    assert set(steps("--scale", "0.5", "--steps", "7")) == {7}
+
+
+# Options that only look, or save memory.
+
+
+def test_what_is_looked_at_reaches_log_events_and_terminal(common, tmp_path, monkeypatch, capsys):
+    """The program and the diagnosis are real; the two terms are small functions of the leaves both halves share."""
+
+    def loss(trainable, frozen, batch, key, *, config, draws=1, remat="full"):
+        kept = flatten(frozen)
+        assert kept["dit/blocks/self_attn/q/kernel"].dtype == jnp.bfloat16
+        assert {x.dtype for p, x in kept.items() if p.startswith("vae/")} == {jnp.dtype("float32")}
+        leaves = jax.tree.leaves(trainable)
+        terms = {
+            "flow": sum(jnp.square(x - 1.0).mean() for x in leaves),
+            "photometric": sum(jnp.square(x - 2.0).mean() for x in leaves),
+        }
+        return terms["flow"] + config.flow.photometric * terms["photometric"], terms
+
+    monkeypatch.setattr(model, "loss", loss)
+    monkeypatch.setattr(diagnose, "flow_by_sigma", lambda p, b, k, sigmas, **_: jnp.asarray(sigmas))
+    pool = write_pool(tmp_path / "pool", (32, 48))
+    given = ["--data", pool, "--out", tmp_path, "--steps", 3, "--frozen-dtype", "bfloat16"]
+    run(*common, *given, "--diagnose-every", 2, "--tensorboard", "--show-mesh")
+    rows = [json.loads(line) for line in (tmp_path / "lora/log.jsonl").read_text().splitlines()]
+    shown = {"flow_grad_norm", "photometric_grad_norm", "grad_cosine", "flow_sigma_0.06"}
+    assert [shown <= row.keys() for row in rows] == [False, True, True]  # and after the last step
+    assert rows[1]["flow_grad_norm"] > rows[1]["photometric_grad_norm"] > 0
+    assert 0.9 < rows[1]["grad_cosine"] <= 1.0 + 1e-6
+    events = list((tmp_path / "lora/tensorboard").glob("events.out.tfevents.*"))
+    written = b"".join(file.read_bytes() for file in events)
+    assert b"lora/loss" in written and b"lora/grad_cosine" in written
+    said = capsys.readouterr().out
+    assert said.count("mesh data=1, fsdp=1, seq=1") == 2  # of what trains and of what is frozen
+    stage = stages.lora_stage(1, frames=config.preset("tiny").frames)
+    for tree in stages.stage_specs(config.preset("tiny"), stage):
+        assert all(f"{path} " in said for path in flatten(tree))

@@ -20,10 +20,19 @@ METHODS = {
 }
 
 SCHEDULES = ("uniform", "shift", "graded", "optimised")
+PAIRED = ("latent_error", "psnr_to_euler50")  # differences within a scene
+ROWS = (
+    ("evaluations", "latent_error", "relative L2 error of the latents\n(grey: reference's self-error, dotted: Euler 50)"),
+    ("seconds", "latent_error", "relative L2 error of the latents"),
+    ("evaluations", "psnr_to_euler50", "PSNR to the truth minus Euler 50's, dB\n(green: 0.1 and 0.5 dB)"),
+    ("seconds", "psnr_to_euler50", "PSNR to the truth minus Euler 50's, dB"),
+    ("evaluations", "consistency", "agreement of frames 4 apart, dB\n(dotted: Euler 50; blur raises it)"),
+    ("evaluations", "sharpness_ratio", "sharpness ratio to the truth\n(dotted: Euler 50)"),
+)  # fmt: skip
 
 
 def samplers(report: Report, path: Path) -> None:
-    """Rows: error over evaluations, PSNR and sharpness beside Euler's, error over seconds. Columns: schedules."""
+    """Rows: ROWS. Columns: schedules. Shaded: intervals over scenes; horizontal bars: the slowest and fastest run."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -35,7 +44,8 @@ def samplers(report: Report, path: Path) -> None:
     floor = report["reference"]["self_error"]["latent_error"]["mean"]
     euler = report["euler50"]["metrics"]
     columns = len(schedules)
-    fig, axes = plt.subplots(4, columns, figsize=(3 + 3 * columns, 14), sharey="row", squeeze=False)
+    size = (3 + 3 * columns, 1 + 3.2 * len(ROWS))
+    fig, axes = plt.subplots(len(ROWS), columns, figsize=size, sharey="row", squeeze=False)
     for column, schedule in enumerate(schedules):
         for solver in COLOURS:
             wanted = ("adaptive",) if solver == "bosh3" else (schedule,)
@@ -45,20 +55,13 @@ def samplers(report: Report, path: Path) -> None:
             mine.sort(key=lambda r: r["evaluations"])
             if not mine:
                 continue
-            style = {"color": COLOURS[solver], "marker": MARKERS[solver], "ms": 4.5, "lw": 1.2}
-            for row, (x, value) in enumerate(ROWS):
-                ax = axes[row, column]
-                found = [value(r) for r in mine]
-                ax.plot([r[x] for r in mine], [v["mean"] for v in found], label=solver, **style)
-                low, high = ([v[k] for v in found] for k in ("low", "high"))
-                ax.fill_between(
-                    [r[x] for r in mine], low, high, color=COLOURS[solver], alpha=0.08, lw=0
-                )
-                for r, v in zip(mine, found):
+            for ax, (x, metric, _) in zip(axes[:, column], ROWS):
+                sampler_curve(ax, mine, x, metric, solver)
+                for r in mine:
                     if [r["solver"], r["schedule"], str(r["steps"])] == default:
-                        ax.plot(r[x], v["mean"], "o", ms=14, mfc="none", mec="k", mew=1.6, zorder=5)
-        for row, (x, _) in enumerate(ROWS):
-            ax = axes[row, column]
+                        at = (work(r, x), value(r, metric)["mean"])
+                        ax.plot(*at, "o", ms=14, mfc="none", mec="k", mew=1.6, zorder=5)
+        for ax, (x, metric, label) in zip(axes[:, column], ROWS):
             ax.set_xscale("log")
             ax.grid(True, which="major", alpha=0.25)
             if x == "evaluations":
@@ -69,41 +72,68 @@ def samplers(report: Report, path: Path) -> None:
                 ax.set_xlabel("velocity evaluations")
             else:
                 ax.set_xlabel("seconds a scene (sampling)")
-                plain_seconds(ax, [r["seconds"] for r in report["records"]])
-        for row in (0, 3):
-            ax = axes[row, column]
-            ax.set_yscale("log")
-            ax.axhspan(floor / 10, floor, color="0.85", zorder=0)
-            ax.axhline(euler["latent_error"]["mean"], color="0.35", ls=":", lw=1.2)
-            ax.set_ylim(floor / 2, 1.0)
+                plain_seconds(ax, [s for r in report["records"] for s in r["seconds"].values()])
+            if metric == "psnr_to_euler50":
+                for band, alpha in ((0.5, 0.12), (0.1, 0.25)):
+                    ax.axhspan(-band, band, color="#7fbf7f", alpha=alpha, lw=0, zorder=0)
+                ax.set_ylim(-0.8, 2.0)
+            else:
+                ax.axhline(euler[metric]["mean"], color="0.35", ls=":", lw=1.2)
+            if metric == "latent_error":
+                ax.set_yscale("log")
+                ax.axhspan(floor / 10, floor, color="0.85", zorder=0)
+                ax.set_ylim(floor / 2, 1.0)
+            if column == 0:
+                ax.set_ylabel(label)
         axes[0, column].set_title(f"schedule: {schedule}")
-        for band, alpha in ((0.5, 0.12), (0.1, 0.25)):
-            axes[1, column].axhspan(-band, band, color="#7fbf7f", alpha=alpha, lw=0, zorder=0)
-        axes[1, column].set_ylim(-0.8, 2.0)
-        axes[2, column].axhline(euler["sharpness_ratio"]["mean"], color="0.35", ls=":", lw=1.2)
-        if schedule == "optimised" and not any(
-            r["schedule"] == schedule for r in report["records"]
-        ):
+        if schedule not in seen_in:
             axes[0, column].text(
                 0.5, 0.5, "none stored", transform=axes[0, column].transAxes, ha="center"
             )
-    labels = (
-        "relative L2 error of the latents\n(grey: reference's self-error, dotted: Euler 50)",
-        "PSNR to the truth minus Euler 50's, dB\n(green: 0.1 and 0.5 dB)",
-        "sharpness ratio to the truth\n(dotted: Euler 50)",
-        "relative L2 error of the latents",
-    )
-    for row, label in enumerate(labels):
-        axes[row, 0].set_ylabel(label)
     seen = {}
     for ax in axes.flat:
         for handle, label in zip(*ax.get_legend_handles_labels()):
             seen.setdefault(label, handle)
     seen["default"] = plt.Line2D([], [], ls="", marker="o", ms=11, mfc="none", mec="k", mew=1.6)
-    fig.legend(seen.values(), seen, loc="lower center", ncol=3 * columns, frameon=False)
-    fig.tight_layout(rect=(0, 0.035, 1, 1))
-    fig.savefig(path, dpi=75)
+    fig.legend(seen.values(), seen, loc="lower center", ncol=2 * columns, frameon=False)
+    fig.tight_layout(rect=(0, 0.6 / size[1], 1, 1))
+    save(fig, path)
     plt.close(fig)
+
+
+def save(fig: Any, path: Path) -> None:
+    """A PNG of 256 colours: half the size, the same picture."""
+    import io
+
+    from PIL import Image
+
+    raw = io.BytesIO()
+    fig.savefig(raw, dpi=75)
+    Image.open(raw).convert("RGB").quantize(256).save(path, optimize=True)
+
+
+def work(record: dict, x: str) -> float:
+    return record["seconds"]["median"] if x == "seconds" else record[x]
+
+
+def value(record: dict, metric: str) -> dict[str, float]:
+    return record[metric] if metric == "psnr_to_euler50" else record["metrics"][metric]
+
+
+def sampler_curve(ax: Any, records: list[dict], x: str, metric: str, solver: str) -> None:
+    """One solver over `x`. Intervals where they say how sure a curve is: those of measures to the truth are about how
+    scenes differ, the same for every solver, and would cover the picture.
+    """
+    colour = COLOURS[solver]
+    found = [value(r, metric) for r in records]
+    at, mean = [work(r, x) for r in records], [v["mean"] for v in found]
+    ax.plot(at, mean, color=colour, marker=MARKERS[solver], ms=4.5, lw=1.2, label=solver)
+    if metric in PAIRED:
+        low, high = ([v[k] for v in found] for k in ("low", "high"))
+        ax.fill_between(at, low, high, color=colour, alpha=0.08, lw=0)
+    if x == "seconds":
+        ends = ([r["seconds"][k] for r in records] for k in ("fastest", "slowest"))
+        ax.hlines(mean, *ends, color=colour, lw=1, alpha=0.6)
 
 
 def plain_seconds(ax, seconds: list[float]) -> None:
@@ -116,23 +146,15 @@ def plain_seconds(ax, seconds: list[float]) -> None:
     ax.set_xlim(low, high)
 
 
-ROWS = (
-    ("evaluations", lambda r: r["metrics"]["latent_error"]),
-    ("evaluations", lambda r: r["psnr_to_euler50"]),
-    ("evaluations", lambda r: r["metrics"]["sharpness_ratio"]),
-    ("seconds", lambda r: r["metrics"]["latent_error"]),
-)
-
-
 def knobs(report: Report, path: Path) -> None:
-    """Photos, steps of the peers, size, caches and precision."""
+    """Photos, steps of the peers, size, precision, caches and refinement."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     records = report["knobs"]
-    fig, axes = plt.subplots(2, 3, figsize=(15, 9))
+    fig, axes = plt.subplots(2, 4, figsize=(20, 9))
 
     def curve(ax, rows, metric, x, method, label=None):
         colour, marker = METHODS[method]
@@ -182,32 +204,70 @@ def knobs(report: Report, path: Path) -> None:
     ax.set(xlabel="velocity evaluations (3 photos)", ylabel="PSNR to the truth, dB")
     ax.legend(fontsize=8)
 
+    def point(ax, r, metric, colour, marker="o", text="", below=False):
+        v, s = r["metrics"][metric], r["seconds"]
+        across = [[s["median"] - s["fastest"]], [s["slowest"] - s["median"]]]
+        up = [[v["mean"] - v["low"]], [v["high"] - v["mean"]]]
+        ax.errorbar(s["median"], v["mean"], up, across, fmt=marker, color=colour, capsize=3)
+        ax.annotate(text, (s["median"], v["mean"]), xytext=(7, -5 if below else 5), textcoords="offset points", va="top" if below else "bottom", fontsize=8)  # fmt: skip
+
     ax = axes[1, 1]
-    for r in (r for r in records if r["knob"] == "resolution"):
-        v = r["metrics"]["psnr"]
-        ax.errorbar(r["seconds"], v["mean"], [[v["mean"] - v["low"]], [v["high"] - v["mean"]]], fmt="o", color="#d62728", capsize=3)  # fmt: skip
-        ax.annotate(f"{r['value']}\nsharpness {r['metrics']['sharpness_ratio']['mean']:.2f}", (r["seconds"], v["mean"]), xytext=(7, 5), textcoords="offset points", fontsize=8)  # fmt: skip
-    ax.set(xlabel="seconds a scene (sampling)", ylabel="PSNR at the training size, dB", title="size of photos and frames, default sampler")  # fmt: skip
-    seconds = [r["seconds"] for r in records if r["knob"] == "resolution"]
-    plain_seconds(ax, [min(seconds), 2 * max(seconds)])
+    sizes = [r for r in records if r["knob"] == "resolution"]
+    for r in sizes:
+        sharpness = r["metrics"]["sharpness_ratio"]["mean"]
+        point(ax, r, "psnr", "#d62728", text=f"{r['value']}\nsharpness {sharpness:.2f}")
+    ax.set(ylabel="PSNR at the training size, dB", title="size of photos and frames, default sampler")  # fmt: skip
+    plain_seconds(ax, spread_of(sizes, 2))
+
+    ax = axes[0, 3]
+    numbers = [r for r in records if r["knob"] == "numbers"]
+    for r in numbers:
+        sharpness = r["metrics"]["sharpness_ratio"]["mean"]
+        kind = "s" if r["value"] == "bfloat16" else "o"
+        gap = f"\n{r['psnr_to_exact']['mean']:+.3f} dB" if "psnr_to_exact" in r else ""
+        text = f"{r['value']}\nsharpness {sharpness:.3f}{gap}"
+        point(ax, r, "psnr", "#d62728", kind, text, below=kind == "s")
+    ax.set(ylabel="PSNR to the truth, dB", title="numbers of the weights, default sampler")
+    plain_seconds(ax, spread_of(numbers, 2))
 
     ax = axes[1, 2]
     cached = [r for r in records if r["knob"] == "cache"]
     for r in cached:
-        kind = r["value"].split(", ")[1]
-        v = r["metrics"]["latent_error"]
-        ax.errorbar(r["seconds"], v["mean"], [[v["mean"] - v["low"]], [v["high"] - v["mean"]]], fmt="o" if kind == "exact" else "s", color="k" if kind == "exact" else "#ff7f0e", capsize=3)  # fmt: skip
-        ax.annotate(r["value"], (r["seconds"], v["mean"]), xytext=(7, 8 if kind == "exact" else -12), textcoords="offset points", fontsize=8)  # fmt: skip
-    ax.plot([r["seconds"] for r in full], [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, other step counts")  # fmt: skip
-    ax.set(yscale="log", xlabel="seconds a scene (sampling)", ylabel="relative L2 error of the latents", title="block cache (squares) against exact (dots)")  # fmt: skip
-    seconds = [r["seconds"] for r in [*full, *cached]]
-    plain_seconds(ax, [min(seconds), 3 * max(seconds)])
+        exact = r["value"].endswith(", exact")
+        style = ("k", "o") if exact else ("#ff7f0e", "s")
+        point(ax, r, "latent_error", *style, r["value"], below=not exact)
+    at = [work(r, "seconds") for r in full]
+    ax.plot(at, [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, other step counts")  # fmt: skip
+    ax.set(yscale="log", ylabel="relative L2 error of the latents", title="block cache (squares) against exact (dots)")  # fmt: skip
+    plain_seconds(ax, spread_of([*full, *cached], 6))
     ax.legend(fontsize=8)
+
+    ax = axes[1, 3]
+    toys = [r for r in records if r["knob"] == "refinement"]
+    for r in toys:
+        s = r["seconds"]
+        across = [[s["median"] - s["fastest"]], [s["slowest"] - s["median"]]]
+        gap = r["relative_difference_of_features"]
+        ax.errorbar(s["median"], gap, None, across, fmt="o", color="k", capsize=3)
+        name = {"per_view": "exact (per view)"}.get(r["value"], r["value"])
+        ax.annotate(f"{name}\ndiffers by {gap:.3f}", (s["median"], gap), xytext=(7, 8), textcoords="offset points", fontsize=8)  # fmt: skip
+    top = max((r["relative_difference_of_features"] for r in toys), default=0.0)
+    ax.set(ylim=(-0.1 * top, 1.3 * top or 1.0), ylabel="relative L2 difference of ray features", title="refinement of scene tokens, random toy")  # fmt: skip
+    plain_seconds(ax, spread_of(toys, 2))
+    ax.set_xlabel("seconds, all views (ray features)")
+    for ax in (axes[0, 3], axes[1, 1], axes[1, 2]):
+        ax.set_xlabel("seconds a scene (sampling)")
     for ax in axes.flat:
         ax.grid(True, alpha=0.25)
     fig.tight_layout()
-    fig.savefig(path, dpi=75)
+    save(fig, path)
     plt.close(fig)
+
+
+def spread_of(records: list[dict], room: float) -> list[float]:
+    """All seconds of `records`, and `room` times the largest for what is written beside it."""
+    seconds = [s for r in records for s in r["seconds"].values()]
+    return [*seconds, room * max(seconds)]
 
 
 def with_tables(text: str, report: Report) -> str:
@@ -217,6 +277,28 @@ def with_tables(text: str, report: Report) -> str:
     assert rest, f"docs/solvers.md lacks the marker {begin}"
     _, _, tail = rest.partition(end)
     return f"{head}{begin}\n{tables(report)}\n{end}{tail}"
+
+
+def goals(verdict: dict[str, Any]) -> list[str]:
+    """The rule of `mini_quality.verdict` and what it found, as Markdown."""
+    lines = [
+        "Goals. Reached: some sampler within the evaluations has Euler 50's PSNR within the limit, either way (mean over scenes, "
+        "same photos and noise), and its sharpness within 2 %. Named: of those, the closest to the reference.",
+        "",
+    ]
+    number = lambda v: f"{v['mean']:.2f} ({v['low']:.2f} .. {v['high']:.2f})"  # noqa: E731
+    for goal in verdict["goals"]:
+        state = "reached" if goal["reached"] else "**not reached**"
+        lines.append(
+            f"* at most {goal['evaluations']} evaluations within {goal['limit_db']} dB of Euler 50: {state} by {goal['passing']} of "
+            f"{goal['samplers']} samplers, {goal['passing_by_interval']} with their whole interval "
+            f"(`{goal['point']}`: {number(goal['psnr_to_euler50'])} dB)."
+        )
+    fewest = verdict.get("fewest_evaluations_within_goal", "none")
+    return [
+        *lines,
+        f"* fewest evaluations within 0.1 dB and 2 % of sharpness of Euler 50: `{fewest}`; the default is `{verdict['default']}`.",
+    ]
 
 
 def tables(report: Report) -> str:
@@ -231,7 +313,8 @@ def tables(report: Report) -> str:
         f"Reference: {s['reference']}, self-error {report['reference']['self_error']['latent_error']['mean']:.1e}, "
         f"PSNR {number(report['reference']['metrics']['psnr'])} dB, sharpness {number(report['reference']['metrics']['sharpness_ratio'])}. "
         f"Euler, 50 uniform steps: latent error {euler['metrics']['latent_error']['mean']:.3f}, PSNR {number(euler['metrics']['psnr'])} dB, "
-        f"sharpness {number(euler['metrics']['sharpness_ratio'])}, {euler['seconds']:.2f} s a scene.",
+        f"sharpness {number(euler['metrics']['sharpness_ratio'])}, {euler['seconds']['median']:.2f} s a scene. "
+        "Seconds: median of three runs after an uncounted one (fastest and slowest in the JSON and the charts).",
         "",
         "Closest to the reference within each number of evaluations, on each schedule:",
         "",
@@ -251,7 +334,7 @@ def tables(report: Report) -> str:
             m = r["metrics"]
             lines.append(
                 f"| {r['evaluations']} | {schedule} | `{r['solver']}`, {r['steps']} | {m['latent_error']['mean']:.4f} | "
-                f"{number(r['psnr_to_euler50'])} | {m['sharpness_ratio']['mean']:.3f} | {m['psnr_reference']['mean']:.1f} | {r['seconds']:.2f} |"
+                f"{number(r['psnr_to_euler50'])} | {m['sharpness_ratio']['mean']:.3f} | {m['psnr_reference']['mean']:.1f} | {r['seconds']['median']:.2f} |"
             )
     solver, schedule, _ = report["verdict"]["default"].split()
     own = [r for r in report["records"] if r["solver"] == solver and r["schedule"] == schedule]
@@ -266,20 +349,11 @@ def tables(report: Report) -> str:
         v = r["metrics"]
         lines.append(
             f"| {r['evaluations']} | {v['latent_error']['mean']:.3f} | {number(v['psnr'])} | {v['sharpness_ratio']['mean']:.3f} | "
-            f"{v['gradient_psnr']['mean']:.2f} | {v['consistency']['mean']:.1f} | {r['seconds']:.2f} |"
+            f"{v['gradient_psnr']['mean']:.2f} | {v['consistency']['mean']:.1f} | {r['seconds']['median']:.2f} |"
         )
-    lines += ["", "Goals (two-sided, by the point closest to the reference):", ""]
-    for goal in report["verdict"]["goals"]:
-        state = "reached" if goal["reached"] else "**not reached**"
-        sure = "" if goal["reached_by_interval"] else ", not by the whole interval"
-        lines.append(
-            f"* at most {goal['evaluations']} evaluations within {goal['limit_db']} dB of Euler 50: {state}{sure} "
-            f"(`{goal['point']}`: {number(goal['psnr_to_euler50'])} dB)."
-        )
-    fewest = report["verdict"].get("fewest_evaluations_within_goal", "none")
     lines += [
-        f"* fewest evaluations within 0.1 dB and 2 % of sharpness of Euler 50: `{fewest}`; "
-        f"the default is `{report['verdict']['default']}`.",
+        "",
+        *goals(report["verdict"]),
         "",
         "Other knobs, default sampler:",
         "",
@@ -290,7 +364,7 @@ def tables(report: Report) -> str:
         if "metrics" not in r:
             continue
         m = r["metrics"]
-        seconds = f"{r['seconds']:.2f}" if "seconds" in r else ""
+        seconds = f"{r['seconds']['median']:.2f}" if "seconds" in r else ""
         lines.append(
             f"| {r['knob']} | {r['value']} | {r['method']} | {number(m['psnr'])} | {m['sharpness_ratio']['mean']:.3f} | "
             f"{m['consistency']['mean']:.1f} | {seconds} |"
@@ -298,6 +372,6 @@ def tables(report: Report) -> str:
     for r in report["knobs"]:
         if r["knob"] == "refinement":
             lines.append(
-                f"| refinement | {r['value']} | {r['method']} | differs by {r['relative_difference_of_features']:.3f} | | | {r['seconds']:.3f} |"
+                f"| refinement | {r['value']} | {r['method']} | differs by {r['relative_difference_of_features']:.3f} | | | {r['seconds']['median']:.3f} |"
             )
     return "\n".join(lines)

@@ -8,7 +8,7 @@ of the target slots is the same for every M. Noise comes from (scene, 0) through
 import functools
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,12 +17,14 @@ import numpy as np
 
 from roge_jax import model
 from roge_jax.config import RoGeConfig
+from roge_jax.core.params import flatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import make_sample
 from roge_jax.evaluate import spread
 from roge_jax.video import flow, solvers
 
 CONTEXTS, DEFAULT_M = 6, 3
+REPEATS = 3  # timed runs of a point, after one that is not timed
 ALL_SOLVERS = tuple(name for name, entry in solvers.SOLVERS.items() if entry.method is not None)
 
 
@@ -101,10 +103,25 @@ def assemble(
     )
 
 
+def timed(call: Callable[[], Any], parts: int = 1) -> tuple[Any, dict[str, float]]:
+    """(result of a first call, seconds of REPEATS more, each divided by `parts`: {median, fastest, slowest}).
+
+    The first call compiles what is new to it and is not counted.
+    """
+    result = jax.block_until_ready(call())
+    seconds = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        jax.block_until_ready(call())
+        seconds.append((time.perf_counter() - began) / parts)
+    middle = float(np.median(seconds))
+    return result, {"median": middle, "fastest": min(seconds), "slowest": max(seconds)}
+
+
 class Run(NamedTuple):
     latents: jax.Array  # [s, t, lh, lw, 16] of the targets
     evaluations: int
-    seconds: float  # sampling alone, a scene
+    seconds: dict[str, float] | None = None  # sampling alone, a scene; of a `timed` run
 
 
 class Sampler:
@@ -113,6 +130,7 @@ class Sampler:
     def __init__(self, params: Any, scenes: Scenes, config: RoGeConfig):
         self.params, self.scenes, self.config = params, scenes, config
         self._velocity = _compiled(config)
+        self._seconds: dict[tuple[str, int], dict[str, float]] = {}
 
     def velocity(self, x: jax.Array, sigma: jax.Array) -> jax.Array:
         """[s, t, lh, lw, 16] of all scenes at one noise level."""
@@ -125,17 +143,28 @@ class Sampler:
         )
 
     def run(self, solver: str, grid: np.ndarray, velocity: Any = None) -> Run:
-        """One fixed-step sampler, of another `velocity(x, sigma)` than the model's if one is given."""
-        began = time.perf_counter()
+        """One fixed-step sampler, of another `velocity(x, sigma)` than the model's if one is given; not timed."""
         count, end = 0, self.scenes.noise
         for done, _, x in solvers.iterate(solver, velocity or self.velocity, end, grid):
             count, end = done, x
-        end = jax.block_until_ready(end)
-        seconds = (time.perf_counter() - began) / len(end)
-        return Run(end[:, self.scenes.m :], count, seconds)
+        return Run(end[:, self.scenes.m :], count)
+
+    def timed(self, solver: str, grid: np.ndarray, start: Callable[[], Any] | None = None) -> Run:
+        """`run` with its seconds; `start()` makes the velocity of a run if it is another than the model's.
+
+        The numbers in a grid do not change the work: grids of one length are timed once.
+        """
+        if start is not None:
+            run, seconds = timed(lambda: self.run(solver, grid, start()), len(self.scenes.noise))
+            return run._replace(seconds=seconds)
+        known = (solver, len(grid))
+        if known in self._seconds:
+            return self.run(solver, grid)._replace(seconds=self._seconds[known])
+        run, self._seconds[known] = timed(lambda: self.run(solver, grid), len(self.scenes.noise))
+        return run._replace(seconds=self._seconds[known])
 
     def adaptive(self, tolerance: float) -> Run:
-        """bosh3; the batch shares its steps."""
+        """bosh3, timed; the batch shares its steps."""
         if not hasattr(self, "_adaptive"):
 
             @jax.jit
@@ -147,13 +176,9 @@ class Sampler:
                 return solvers.solve("bosh3", velocity, noise, ends, tolerance=tolerance)
 
             self._adaptive = whole
-            self.adaptive(1.0)  # compiles
         s = self.scenes
-        began = time.perf_counter()
-        x, info = jax.block_until_ready(
-            self._adaptive(self.params, s.prepared, s.noise, jnp.float32(tolerance))
-        )
-        seconds = (time.perf_counter() - began) / len(x)
+        arguments = (self.params, s.prepared, s.noise, jnp.float32(tolerance))
+        (x, info), seconds = timed(lambda: self._adaptive(*arguments), len(s.noise))
         solvers.raise_if_failed(info)
         return Run(x[:, s.m :], int(info.evaluations), seconds)
 
@@ -184,8 +209,13 @@ def most_steps(solver: str, budget: int) -> int:
 
 
 def fingerprint(params: Any) -> str:
-    """Twelve hexadecimal digits that change with any weight of the velocity network."""
+    """Twelve hexadecimal digits that change with the name, shape or any number of any leaf.
+
+    Every part has a say in a sampled video: the reconstruction (encoder, renderer) and the fusion make the condition, the
+    transformer the velocity, the VAE the photos' latents and the preview.
+    """
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(params["dit"]):
+    for path, leaf in sorted(flatten(params).items()):
+        digest.update(f"{path} {leaf.shape} ".encode())
         digest.update(np.asarray(leaf, np.float32).tobytes())
     return digest.hexdigest()[:12]

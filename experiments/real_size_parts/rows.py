@@ -24,7 +24,7 @@ from roge_jax.config import RoGeConfig
 from roge_jax.core.params import Tree, flatten, unflatten
 from roge_jax.fusion import Condition
 from roge_jax.recon.vggt import encoder_grid
-from roge_jax.training import plan, stages
+from roge_jax.training import estimate, stages
 from roge_jax.training.loop import initial_state
 from roge_jax.training.optim import make_optimiser
 from roge_jax.video import flow, solvers
@@ -221,7 +221,9 @@ def training_step(row: Row, dtype: Any) -> Job:
     needs, failed = {}, ""
     for remat in ("none", "dots", "attention", "full"):
         stage = dataclasses.replace(stage, remat=remat)
-        found = plan.plan(cfg, stage, m=m, dtype=dtype, fused_attention=dtype == jnp.bfloat16)
+        found = estimate.estimate(
+            cfg, stage, m=m, dtype=dtype, fused_attention=dtype == jnp.bfloat16
+        )
         needs[remat] = found.bytes / 1e9
         if found.bytes > 1.1 * limit:  # the estimate may be too high: near misses are tried
             continue
@@ -237,10 +239,12 @@ def training_step(row: Row, dtype: Any) -> Job:
     )
 
 
-def _step(cfg: RoGeConfig, stage: stages.Stage, m: int, dtype: Any, found: plan.Plan, needs) -> Job:
+def _step(
+    cfg: RoGeConfig, stage: stages.Stage, m: int, dtype: Any, found: estimate.Estimate, needs
+) -> Job:
     start = time.perf_counter()
     specs, frozen_specs = stages.stage_specs(cfg, stage)
-    step, shapes = plan.abstract_step(cfg, stage, m, scenes=1, dtype=dtype)
+    step, shapes = estimate.abstract_step(cfg, stage, m, scenes=1, dtype=dtype)
     run = jax.jit(step, donate_argnums=0).lower(*shapes).compile()
     seconds = time.perf_counter() - start
     frozen = weights(frozen_specs, dtype)

@@ -28,6 +28,7 @@ from ..core.layers import (
     unpatchify,
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
+from ..core.sharding import ways
 
 CELL = 4  # pixels, along both axes
 NEAREST = 0.25  # depth of the last cut in the normalised scene; the first is at infinity
@@ -193,38 +194,34 @@ def look_up(
     photos [m, h, w, 3] in [0, 1]; cameras (K, c2w) of the v views and of the m photos, in the normalised frame.
     """
     v, gh, gw, d = features.shape
-    h, w = photos.shape[1:3]
-    size = ch, cw = h // CELL, w // CELL
+    ch = photos.shape[1] // CELL
     way = motion(*cameras, *photo_cameras)
     maps = jnp.concatenate([_features(p["features"], photos), _cells(photos)], -1)
     tokens = layer_norm(p["norm"], features.reshape(v, gh * gw, d), eps=EPS)
     tokens = unpatchify(linear(p["prior"], tokens), (gh, gw), ch // gh)
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
-    shrink = jnp.asarray([1 / CELL, 1 / CELL, 1.0])
-    shrunk = Motion(shrink[None, None, :, None] * way.turn, shrink[None, None] * way.shift)
-    low = _cells(head)
     alike = twins(photo_cameras[1])
-    coarse = jax.vmap(jax.checkpoint(lambda *a: _coarse(p, maps, alike, *a)))
-    colours, cut, sure, hidden = coarse(shrunk, prior, context, low)
 
-    weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
-    weights = jax.nn.softmax(weights.reshape(v, ch, cw, CELL**2, 9), -1)
+    @jax.checkpoint
+    def one(way, prior, context, head, far):
+        coarse, cut, sure, hidden = _coarse(
+            p, maps, alike, way, prior, context, _cells(head[None])[0]
+        )
+        weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
+        cut, sure = (_upsampled(weights, x) for x in (cut, sure))
+        found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, cut, head)
+        apart, chord = (x[:, None, None, None] for x in far)
+        far = apart * inverse_depth(cut, cuts)[None, ..., None] + chord
+        looked, some, scene = _chosen(p["choose"], found, seen, alike, far, head)
+        about = jnp.concatenate([scene, sure[..., None]], -1)
+        return Looked(_merged(p["merge"], head, looked, some, about), head, looked, coarse)
 
-    def upsampled(x):  # [v, ch, cw] -> [v, h, w], every pixel a mean of the nine cells around it
-        x = jnp.pad(x, ((0, 0), (1, 1), (1, 1)), mode="edge")
-        nine = jnp.stack([x[:, i : i + ch, j : j + cw] for i in range(3) for j in range(3)], -1)
-        x = (weights * nine[..., None, :]).sum(-1)
-        return unpatchify(x.reshape(v, ch * cw, CELL**2), size, CELL)[..., 0]
-
-    fine = jax.vmap(jax.checkpoint(lambda *a: _fine(p["fine"], photos, alike, cuts, *a)))
-    found, seen, cut = fine(way, upsampled(cut), head)
-    far = _distance(cameras[1], photo_cameras[1], inverse_depth(cut, cuts))
-    looked, some, scene = _chosen(p["choose"], found, seen, alike, far, head)
-    rgb = _merged(
-        p["merge"], head, looked, some, jnp.concatenate([scene, upsampled(sure)[..., None]], -1)
-    )
-    return Looked(rgb, head, looked, colours)
+    views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
+    # Of a lone CPU's caches and memory one view at a time makes the most.
+    if jax.default_backend() == "cpu" and ways("seq") == 1:
+        return jax.lax.map(lambda view: one(*view), views)
+    return jax.vmap(one)(*views)
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:
@@ -241,6 +238,8 @@ def _coarse(p: Tree, maps, alike, way: Motion, prior, context, head):
     state [ch, cw, c].
     """
     ch, cw, cuts = prior.shape
+    shrink = jnp.asarray([1 / CELL, 1 / CELL, 1.0])
+    way = Motion(shrink[None, :, None] * way.turn, shrink[None] * way.shift)
     numbers = jnp.arange(cuts, dtype=jnp.float32)
     inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, ch * cw))
     values, seen = fetch(maps, way, _pixels(ch, cw, CELL), inverse)
@@ -297,51 +296,56 @@ def _fine(p: Tree, photos, alike, cuts: int, way: Motion, cut, head):
     return found, (share * seen[..., None]).sum(1).reshape(m, h, w, 1), refined
 
 
-def _distance(c2w, photo_c2w, inverse) -> jax.Array:
-    """How far photos are from views as `metrics.baselines.view_distances` says it, per pixel [v, m, h, w, 1]:
-    distance of the centres over the depth, and the angle between the cameras as a chord.
+def _upsampled(weights, x) -> jax.Array:
+    """[ch, cw] -> [4 ch, 4 cw], every pixel a mean of the nine cells around it by weights [ch, cw, 16 * 9]."""
+    ch, cw = x.shape
+    weights = jax.nn.softmax(weights.reshape(ch, cw, CELL**2, 9), -1)
+    x = jnp.pad(x, 1, mode="edge")
+    nine = jnp.stack([x[i : i + ch, j : j + cw] for i in range(3) for j in range(3)], -1)
+    x = (weights * nine[:, :, None]).sum(-1)
+    return unpatchify(x.reshape(1, ch * cw, CELL**2), (ch, cw), CELL)[0, ..., 0]
+
+
+def _distances(c2w, photo_c2w) -> tuple[jax.Array, jax.Array]:
+    """How far photos are from views as `metrics.baselines.view_distances` says it: distance of the centres, to be divided
+    by the depth, and the angle between the cameras as a chord, each [v, m].
     """
     centres = c2w[:, None, :3, 3] - photo_c2w[None, :, :3, 3]
     turns = c2w[:, None, :3, :3] - photo_c2w[None, :, :3, :3]
-    apart, chord = (
-        jnp.sqrt(jnp.square(centres).sum(-1)),
-        jnp.sqrt(jnp.square(turns).sum((-1, -2)) / 2),
-    )
-    return (apart[:, :, None, None] * inverse[:, None] + chord[:, :, None, None])[..., None]
+    apart = jnp.sqrt(jnp.square(centres).sum(-1))
+    return apart, jnp.sqrt(jnp.square(turns).sum((-1, -2)) / 2)
 
 
 def _chosen(p: Tree, found, seen, alike, far, head):
-    """The photos' colours [v, m, h, w, 3] weighed: (colour [v, h, w, 3], how much of it is seen [v, h, w, 1], two numbers
-    per pixel about the choice [v, h, w, 2]).
+    """The photos' colours [m, h, w, 3] weighed, from how much of them is seen and how far they are [m, h, w, 1]: (colour
+    [h, w, 3], how much of it is seen [h, w, 1], two numbers per pixel about the choice [h, w, 2]).
 
     The choice starts from 1 / distance^2 among photos that see the cut.
     """
-    v, m, h, w, _ = found.shape
-    shared = jax.vmap(witnesses, (0, None))
-    weight = shared(seen, alike)
-    total = weight.sum(1, keepdims=True)
-    mean = (found * weight).sum(1, keepdims=True) / jnp.maximum(total, EPS)
-    nearest = far.min(1, keepdims=True)
-    odd = jnp.abs(found - mean).mean(-1, keepdims=True)
+    weight = witnesses(seen, alike)
+    mean = (found * weight).sum(0) / jnp.maximum(weight.sum(0), EPS)
+    nearest = far.min(0, keepdims=True)
+    change = found - mean[None]
+    odd = jnp.abs(change).mean(-1, keepdims=True)
     ratio = nearest / (far + 1e-3)
-    known = [found - head[:, None], found - mean, odd, seen, far, far - nearest, ratio]
-    y = jnp.concatenate(known, -1).reshape(v * m, h, w, -1)
-    y = conv2d(p["conv2"], jax.nn.relu(conv2d(p["conv1"], y))).reshape(v, m, h, w, 1)
+    known = [found - head[None], change, odd, seen, far, far - nearest, ratio]
+    y = jax.nn.relu(conv2d(p["conv1"], jnp.concatenate(known, -1)))
+    y = conv2d(p["conv2"], y)
     near = -2.0 * jnp.log(far / (nearest + 1e-3) + 1e-2)
-    share = jax.nn.softmax(y + jnp.log(shared(seen + 1e-4, alike)) + near, 1)
-    looked = (share * found).sum(1)
-    spread = (share * jnp.square(found - looked[:, None])).sum(1).mean(-1, keepdims=True)
-    about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(1)], -1)
-    return looked, (share * seen).sum(1), about
+    share = jax.nn.softmax(y + jnp.log(witnesses(seen + 1e-4, alike)) + near, 0)
+    looked = (share * found).sum(0)
+    spread = (share * jnp.square(found - looked[None])).sum(0).mean(-1, keepdims=True)
+    about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(0)], -1)
+    return looked, (share * seen).sum(0), about
 
 
 def _merged(p: Tree, head, looked, some, about) -> jax.Array:
-    """The RGB head's picture and the photos' colours, mixed and corrected."""
+    """The RGB head's picture of a view and the photos' colours, mixed and corrected."""
     change = looked - head
     odd = jnp.abs(change).mean(-1, keepdims=True)
     y = jnp.concatenate([head - 0.5, looked - 0.5, change, odd, some, about], -1)
-    y = jax.nn.relu(conv2d(p["conv1"], y))
+    y = jax.nn.relu(conv2d(p["conv1"], y[None]))
     y = y + jax.nn.relu(conv2d(p["conv2"], y))
-    y = conv2d(p["conv3"], y)
+    y = conv2d(p["conv3"], y)[0]
     mixed = head + jax.nn.sigmoid(y[..., :1]) * some * change + y[..., 1:]
     return jnp.clip(mixed, 0.0, 1.0)

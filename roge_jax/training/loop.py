@@ -28,6 +28,7 @@ from ..core import sharding
 from ..core.distributed import global_batch, is_main
 from ..core.params import Tree
 from ..errors import UserError
+from ..folders import put
 from .optim import OptimConfig, ema_update, make_optimiser
 
 
@@ -309,6 +310,16 @@ def train(
     return state
 
 
+def check_batch(batch: int, mesh: sharding.AnyMesh) -> None:
+    """Raise `UserError` if the mesh cannot split a batch of this size."""
+    data = mesh.shape["data"]
+    if batch % data:
+        raise UserError(
+            f"A batch of {batch} cannot be split over data={data}: use --batch {max(data, batch // data * data)}, or "
+            f"--mesh with a data that divides {batch}."
+        )
+
+
 def held_out_change(log: Path) -> str:
     """What a run's log says of the held-out loss, as the end of a sentence; empty without evaluations."""
     rows = [json.loads(line) for line in log.read_text().splitlines()]
@@ -386,4 +397,4 @@ def _cut_log(path: Path, step: int) -> None:
                 kept.append(line)
     temporary = path.with_suffix(".part")
     temporary.write_text("".join(f"{line}\n" for line in kept))
-    temporary.replace(path)
+    put(temporary, path)

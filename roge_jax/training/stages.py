@@ -128,8 +128,12 @@ _SMALL = dataclasses.replace(_SCRATCH, name="adamw", warmup=30, betas=(0.9, 0.98
 RECON = "^(encoder|renderer/(?!lookup/))"  # all of the reconstruction but the look-up
 
 
-def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
-    """The recipe of the shipped small model, in order; `scale` multiplies every number of steps."""
+def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list[Stage]:
+    """The recipe of the shipped small model, in order; `scale` multiplies every number of steps.
+
+    `side`: pixels of the shorter side of a picture, which crops do not exceed.
+    """
+    crop = min(64, side)
     video = ViewConfig(targets=frames, ordered=True)
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
@@ -137,9 +141,9 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
     few = ViewConfig(targets=4, near=0.3, faults=0.3)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
-        Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=64),
+        Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=crop),
         # Whole windows: after short clips alone, frames from the sixth on lose up to 6 dB.
-        Stage("vae_longer", "vae", "^vae/", 1500, 1, _GENTLE, video, crop=64),
+        Stage("vae_longer", "vae", "^vae/", 1500, 1, _GENTLE, video, crop=crop),
         Stage("recon_low", "recon", RECON, 3000, 16, _SCRATCH, views, recon_shrink=2),
         Stage("recon", "recon", RECON, 3000, 8, _SCRATCH, ViewConfig(targets=6)),
         Stage("lookup", "recon", "^renderer/lookup/", 3000, 3, _SMALL, few, lookup=True),
@@ -156,7 +160,9 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17) -> list[Stage]:
             about_preview=True,
         ),
         # The latents stay as the generator knows them: only their decoding still improves.
-        Stage("vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=64),
+        Stage(
+            "vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=crop
+        ),
         Stage(
             "joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4
         ),

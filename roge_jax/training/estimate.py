@@ -40,7 +40,7 @@ GB = 1e9
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class Estimate:
     """One training step on one device."""
 
     tokens: dict[str, int]
@@ -108,7 +108,7 @@ def abstract_step(
     return make_step(objective, optimiser, stage.optim), arguments
 
 
-def plan(
+def estimate(
     config: RoGeConfig,
     stage: Stage,
     *,
@@ -116,7 +116,7 @@ def plan(
     mesh: sharding.AnyMesh | None = None,
     dtype: Any = jnp.float32,
     fused_attention: bool = False,
-) -> Plan:
+) -> Estimate:
     """What one device of `mesh` (None: a single one) does and holds in a step with m photos (None: the most there are).
 
     `dtype`: of frozen matrices. `fused_attention`: the scores of attention are never stored (GPU, bfloat16).
@@ -163,7 +163,7 @@ def plan(
         name = f"{PARTS.get(part(held.scope), 'the rest')}, {which_pass(held.scope)}"
         by_part[name] = by_part.get(name, 0.0) + held.bytes
     state, frozen, batch, _ = arguments
-    return Plan(
+    return Estimate(
         tokens=tokens,
         parameters={"trained": count(specs), "frozen": count(frozen_specs) if frozen_specs else 0},
         scenes=scenes,
@@ -258,7 +258,7 @@ def default_remat(config: RoGeConfig) -> str:
 
 
 def report(
-    found: Plan,
+    found: Estimate,
     config: RoGeConfig,
     stage: Stage,
     *,

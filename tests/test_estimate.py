@@ -13,7 +13,7 @@ from roge_jax import config, model, train
 from roge_jax.core import program, sharding
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
-from roge_jax.training import plan, stages
+from roge_jax.training import estimate, stages
 
 
 def array(*shape):
@@ -80,7 +80,7 @@ class TestProgram:
 
 def lora(cfg, **changes):
     stage = stages.lora_stage(10, frames=cfg.frames)
-    return dataclasses.replace(stage, remat=plan.default_remat(cfg), **changes)
+    return dataclasses.replace(stage, remat=estimate.default_remat(cfg), **changes)
 
 
 @pytest.mark.slow  # 40 s of compiling each
@@ -100,19 +100,22 @@ def test_a_whole_step_takes_what_xla_says(name):
 
 def test_the_papers_step_fits_80_gb_with_the_default_recomputation():
     cfg = config.preset("paper")
-    found = plan.plan(cfg, lora(cfg), m=6, dtype=jnp.bfloat16, fused_attention=True)
+    found = estimate.estimate(cfg, lora(cfg), m=6, dtype=jnp.bfloat16, fused_attention=True)
     assert 35e9 < found.memory["frozen weights"] < 37e9
     assert found.bytes < 80e9 / 1.1, found.memory
     # LoRA on both halves: 2 passes of linears and 3.5 of attention, and what is computed again.
     assert 1.1e15 < found.flops < 1.7e15
-    assert plan.default_remat(cfg) == "full" and plan.default_remat(config.preset("mini")) == "dots"
+    assert (
+        estimate.default_remat(cfg) == "full"
+        and estimate.default_remat(config.preset("mini")) == "dots"
+    )
 
 
 def test_a_mesh_splits_what_its_table_says():
     cfg = small()
     stage = lora(cfg, batch=4)
     one, eight = (
-        plan.plan(cfg, stage, m=2, mesh=sharding.abstract_mesh(*sizes))
+        estimate.estimate(cfg, stage, m=2, mesh=sharding.abstract_mesh(*sizes))
         for sizes in ((1, 1, 1), (2, 2, 2))
     )
     assert (one.scenes, eight.scenes) == (4, 1)
@@ -123,13 +126,13 @@ def test_a_mesh_splits_what_its_table_says():
     assert eight.memory["frozen weights"] < one.memory["frozen weights"]
     assert 3.9 < one.memory["batch"] / eight.memory["batch"] < 4.1
     with pytest.raises(UserError, match="sizes that divide it"):
-        plan.plan(cfg, stage, m=2, mesh=sharding.abstract_mesh(3))
+        estimate.estimate(cfg, stage, m=2, mesh=sharding.abstract_mesh(3))
 
 
 def test_frozen_leaves_are_counted_in_their_own_type():
     cfg = config.preset("tiny")
     _, frozen = stages.stage_specs(cfg, lora(cfg))
-    half = flatten(plan.abstract_frozen(frozen, jnp.bfloat16))
+    half = flatten(estimate.abstract_frozen(frozen, jnp.bfloat16))
     kinds = {
         "dit/blocks/ffn/fc1/kernel": "bfloat16",
         "dit/blocks/self_attn/norm_q/scale": "float32",
