@@ -11,7 +11,8 @@ PARITY := $(VENV)/.parity
 CODE := roge_jax tests experiments
 # Experiments that draw something; stored sampling grids come first, because the charts use them. Left out: parts of other
 # experiments, and comparisons with PyTorch (`make compare`).
-PARTS := experiments/plan_report.py experiments/plan_runs.py experiments/robustness_report.py
+PARTS := experiments/plan_report.py experiments/plan_runs.py experiments/robustness_report.py \
+	experiments/training_curves.py
 COMPARISONS := experiments/dit_speed.py experiments/vae_speed.py experiments/real_size.py
 FIGURES := experiments/optimise_schedules.py \
 	$(filter-out experiments/optimise_schedules.py $(PARTS) $(COMPARISONS),$(wildcard experiments/*.py))
@@ -57,6 +58,10 @@ format: $(DEV)  ## let ruff order imports and lay out the code
 	$(VENV)/bin/ruff format $(CODE)
 
 figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/figures.md has single ones)
+	$(RUN) -m roge_jax.evaluate --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
+	$(RUN) -m roge_jax.evaluate --sweep 100 130 --out experiments/results/mini_wide.json
+	$(RUN) -m roge_jax.data.procedural sheet --out docs/procedural.png
+	$(RUN) experiments/training_curves.py --draw
 	@for f in $(FIGURES); do echo "== $$f"; $(RUN) $$f || exit 1; done
 
 compare: $(PARITY)  ## speed beside PyTorch (installs torch and diffusers); writes experiments/results

@@ -610,6 +610,9 @@ def test_no_path_is_built_that_is_too_long(place, capsys, tmp_path, monkeypatch)
     (tmp_path / "long.json").write_text(json.dumps(keys))
     code = program(place, "--trajectory", tmp_path / "long.json", out="bad")
     expect_refusal(code, "long.json: give a path of at most 10000", place, capsys)
+    (tmp_path / "long.json").write_text(json.dumps(keys | {"count": 10**15}))
+    code = program(place, "--trajectory", tmp_path / "long.json", out="bad")
+    expect_refusal(code, "long.json: 1000000000000000 frames: give at most 1000000", place, capsys)
 
 
 def test_a_dry_run_counts_the_frames_of_a_path_file(place, photos, capsys, tmp_path):

@@ -19,6 +19,8 @@ from roge_jax.geometry.cameras import (
     validate,
 )
 
+MOST = 1_000_000  # frames that keyframes are interpolated to: more are a slip of the pen
+
 
 def interpolate(
     keys: Cameras, s: np.ndarray, *, times: np.ndarray | None = None, unit: float | None = None
@@ -145,6 +147,8 @@ def load_path(
         times = _times(entries, file)
         count = content.get("count")
         count = 81 if count is None else number(count, str(file), "count", low=1, whole=True)
+        if (frames or count) > MOST:
+            raise UserError(f"{file}: {frames or count} frames: give at most {MOST} of them.")
         s = np.linspace(0.0, 1.0, frames or count)
         return interpolate(cameras, s, times=times)
     if frames is not None and frames != len(cameras):
