@@ -181,7 +181,7 @@ def choose(args: argparse.Namespace, cfg):
     from .training import stages as stages_
 
     if args.stage == "hires" or args.size:
-        cfg = resize(cfg, args.size)
+        cfg = resize(cfg, args.size, hires=args.stage == "hires")
     side = min(cfg.height, cfg.width)
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames, side=side)
     for hires in (False, True):
@@ -248,11 +248,12 @@ def dry_run(args: argparse.Namespace) -> str:
 
 def stage_size(args: argparse.Namespace, stage, cfg):
     """The configuration in a stage: `hires` doubles the size within 'all'; alone, `choose` has set it."""
-    return resize(cfg, None) if args.stage == "all" and stage.name == "hires" else cfg
+    again = args.stage == "all" and stage.name == "hires"
+    return resize(cfg, None, hires=True) if again else cfg
 
 
-def resize(cfg, size: str | None):
-    """The configuration at another size (None: twice its own), of generation and reconstruction alike."""
+def resize(cfg, size: str | None, *, hires: bool):
+    """The configuration at another size (None: twice its own); in `hires` the reconstruction keeps its own (Sec. 3.3)."""
     from .errors import UserError
 
     if size is None:
@@ -262,13 +263,11 @@ def resize(cfg, size: str | None):
             height, width = (int(x) for x in size.lower().split("x"))
         except ValueError:
             raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
-    return dataclasses.replace(
-        cfg,
-        height=height,
-        width=width,
-        recon_height=height * cfg.recon_height // cfg.height // 8 * 8,
-        recon_width=width * cfg.recon_width // cfg.width // 8 * 8,
-    )
+    recon = cfg.recon_height, cfg.recon_width
+    if not hires:
+        recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
+    sizes = {"height": height, "width": width, "recon_height": recon[0], "recon_width": recon[1]}
+    return dataclasses.replace(cfg, **sizes)
 
 
 def on_host():

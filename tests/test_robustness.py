@@ -1,5 +1,6 @@
 """Disturbances do what they say, run-time measures see them, and warnings come beyond measured limits and not within."""
 
+import dataclasses
 import importlib.util
 import json
 import sys
@@ -17,6 +18,7 @@ from scene_files import nerfstudio, truth
 from roge_jax import checkpoint, entry, limits, model, programs, sample
 from roge_jax.config import preset
 from roge_jax.data import perturb
+from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import LimitWarning
 from roge_jax.geometry.cameras import Cameras
 
@@ -92,6 +94,28 @@ def test_captured_photos_have_every_fault_within_its_dose():
     largest = [perturb.TURN, perturb.MOVE, perturb.FOCAL, perturb.STOPS, perturb.NOISE]
     share = np.array(doses) / largest
     assert np.all(share.max(0) < 1.2) and np.all(share.max(0) > 0.8) and np.all(share.min(0) < 0.2)
+
+
+def test_faults_of_samples_are_those_of_the_photos_alone():
+    rng = np.random.default_rng(0)
+    cameras = looking_at_origin(8)
+    rgb = rng.integers(0, 255, (8, 16, 16, 3), dtype=np.uint8)
+    pool = [{"rgb": rgb, "K": cameras.K, "c2w": cameras.c2w}]
+    views = ViewConfig(contexts=(3,), context_weights=(1.0,), targets=2, augment=False, faults=1.0)
+    faulty, plain = (
+        draw_batch(pool, 0, 0, 4, cfg, scale_rule="lagernvs")
+        for cfg in (views, dataclasses.replace(views, faults=0.0))
+    )
+    np.testing.assert_array_equal(faulty["target_rgb"], plain["target_rgb"])
+    np.testing.assert_array_equal(faulty["K"][:, 3:], plain["K"][:, 3:])
+    assert np.all(np.abs(faulty["context_rgb"] - plain["context_rgb"]).mean((2, 3, 4)) > 1e-3)
+    assert np.all(np.abs(faulty["K"] - plain["K"])[:, :3, 0, 0] > 0)
+    scored = dataclasses.replace(views, augment=True, near=1.0).undisturbed()
+    assert (scored.augment, scored.near, scored.faults) == (False, 0.0, 0.0)
+    again = draw_batch(pool, 0, 0, 4, scored, scale_rule="lagernvs")
+    some = draw_batch(pool, 0, 0, 4, dataclasses.replace(scored, faults=0.5), scale_rule="lagernvs")
+    changed = [np.any(some["context_rgb"][i] != again["context_rgb"][i]) for i in range(4)]
+    assert any(changed) and not all(changed)
 
 
 # Measures.

@@ -373,6 +373,8 @@ def test_all_stages_run_and_go_on_after_an_interruption(
     whole = {name: load_model(tmp_path / "whole" / name / "model") for name in order}
     assert {c.height for name, (_, c) in whole.items() if name != "hires"} == {cfg.height}
     assert (whole["hires"][1].height, whole["hires"][1].width) == (2 * cfg.height, 2 * cfg.width)
+    recon = [(c.recon_height, c.recon_width) for _, c in (whole["lora"], whole["hires"])]
+    assert recon[0] == recon[1] == (cfg.recon_height, cfg.recon_width)  # Sec. 3.3
     for before, after in itertools.pairwise(order):  # each goes on from the one before
         assert not same(whole[before][0], whole[after][0])
         held = json.loads((tmp_path / "whole" / after / "settings.json").read_text())

@@ -24,7 +24,7 @@ def heldout_sequences(n: int, height: int, width: int) -> list[dict]:
 
 def heldout(stage: stages.Stage, config: RoGeConfig, scenes: int) -> list[dict[str, np.ndarray]]:
     """One unaltered sample of `CONTEXTS` photos from each held-out scene, with a leading axis of one."""
-    views = dataclasses.replace(stage.views, augment=False, near=0.0, outside=0.0)
+    views = dataclasses.replace(stage.views.undisturbed(), outside=0.0)
     fixed = dataclasses.replace(stage, views=views, batch=1)
     sequences = heldout_sequences(scenes, config.height, config.width)
     return [stages.stage_batch([s], fixed, config, 0, i) for i, s in enumerate(sequences)]

@@ -3,6 +3,7 @@
 A sample is a pure function of (seed, index), so a training run that restarts sees the same data.
 """
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,10 @@ class ViewConfig:
         0.0  # probability that the photos have the faults of a capture (`perturb.captured`)
     )
     size: tuple[int, int] | None = None  # height, width; None: as stored
+
+    def undisturbed(self) -> "ViewConfig":
+        """The same for scoring: views from the whole path, pictures and cameras as they are."""
+        return dataclasses.replace(self, augment=False, near=0.0, faults=0.0)
 
 
 def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):

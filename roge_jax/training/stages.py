@@ -359,15 +359,8 @@ def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: 
         sample_sequence(HELDOUT_SEED + i, frames=frames, height=config.height, width=config.width)
         for i in range(scenes)
     ]
-    views = dataclasses.replace(
-        stage.views,
-        contexts=(3,),
-        context_weights=(1.0,),
-        augment=False,
-        near=0.0,
-        faults=0.0,
-        size=None,
-    )
+    views = stage.views.undisturbed()
+    views = dataclasses.replace(views, contexts=(3,), context_weights=(1.0,), size=None)
     fixed = dataclasses.replace(stage, views=views, batch=4)
     batches = [stage_batch(pool, fixed, config, 0, i) for i in range(scenes // 4)]
     run = jax.jit(objective)
