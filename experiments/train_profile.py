@@ -68,8 +68,9 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
         contexts = model.encode_contexts(p, views["context_rgb"], config=working)
         return contexts, model.encode_targets(p, views["target_rgb"], config=working)
 
-    def transformer(p, x0, features, views):
-        cond = model.condition(p, x0[:photos], features, views, config=working)
+    def transformer(p, x0, features, views, rgb):
+        shown = rgb[photos:]
+        cond = model.condition(p, x0[:photos], features, views, config=working, shown=shown)
         options = {"config": working, "contexts": photos, "remat": stage.remat}
         return model.mean_flow_matching(p, x0, cond, key, draws=stage.draws, **options)
 
@@ -84,15 +85,15 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
     whole = jax.jit(attach)(frozen, trainable)
     reconstruct = functools.partial(model.reconstruct, config=working)
     query = functools.partial(model.query_rays, config=working)
-    picture = functools.partial(model.photometric, config=working)
+    picture = functools.partial(model.decode_rgb, config=working)
     arguments = {"VAE encode": (whole, views), "reconstruction": (whole, views)}
     x0 = jax.numpy.concatenate(compile_("VAE encode", encode, *arguments["VAE encode"]))
     tokens = compile_("reconstruction", reconstruct, *arguments["reconstruction"])
     arguments["ray queries"] = (whole, tokens, views)
     features = compile_("ray queries", query, *arguments["ray queries"])
     arguments["picture"] = (whole, features, views)
-    compile_("picture", picture, *arguments["picture"])
-    arguments["transformer"] = (whole, x0, features, views)
+    rgb = compile_("picture", picture, *arguments["picture"])
+    arguments["transformer"] = (whole, x0, features, views, rgb)
     compile_("transformer", transformer, *arguments["transformer"])
     parts = list(arguments)
     arguments["loss"] = arguments["gradient"] = (trainable, frozen, batch, key)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 from test_sharding import small
 
-from roge_jax import config, model, train
+from roge_jax import checkpoint, config, model, train
 from roge_jax.core import program, sharding
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
@@ -163,3 +163,25 @@ class TestProgramOfTraining:
             self.report("tiny", "--mesh", "data=2", "--batch", "3")
         with pytest.raises(UserError, match="1 to 9 photos"):
             self.report("tiny", "--context", "12")
+
+
+@pytest.mark.slow
+def test_a_steps_time_is_split_into_the_parts_that_it_runs(tmp_path):
+    spec = importlib.util.spec_from_file_location(
+        "train_profile", Path(__file__).parent.parent / "experiments/train_profile.py"
+    )
+    profile = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(profile)
+    cfg = config.preset("tiny")
+    cfg = dataclasses.replace(
+        cfg,
+        fusion=dataclasses.replace(cfg.fusion, preview=True),
+        renderer=dataclasses.replace(cfg.renderer, lookup=8),
+    )
+    checkpoint.save_model(tmp_path / "model", model.init(jax.random.key(0), cfg), cfg)
+    found = profile.profile(str(tmp_path / "model"), photos=2, repeats=1, seed=0)
+    shares = found["share_of_step"]
+    parts = ["VAE encode", "reconstruction", "ray queries", "picture", "transformer"]
+    assert list(shares) == [*parts, "unattributed", "backward", "optimiser"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert all(shares[name] > 0 for name in parts)
