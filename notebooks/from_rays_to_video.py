@@ -38,7 +38,7 @@ for part, tree in params.items():
 # A held-out procedural scene stands in for photos; any folder with a nerfstudio `transforms.json` works the same way.
 
 # %%
-scene = rj.load_scene("procedural:1000000007")
+scene = rj.load_scene("procedural:1000000007", height=config.height, width=config.width)
 contexts = select_context(scene, 3)
 photos, cameras = prepare(scene, contexts, config.height, config.width)
 path = rj.make_path("interpolate", cameras, config.frames)

@@ -49,14 +49,21 @@ def pytest_configure(config):
 
 # Files by the time they take, longest first: `make test` deals out whole files, so that nothing is compiled twice.
 LONGEST = (
-    "model",
-    "procedural",
-    "vae",
-    "readme",
-    "sample",
+    "train_program",
     "notebooks",
+    "procedural",
+    "sample",
+    "model",
+    "lookup",
+    "estimate",
+    "preview",
+    "evaluate",
+    "train_stress",
+    "readme",
+    "vae",
     "dit",
     "solvers",
+    "long",
     "sharding",
 )
 

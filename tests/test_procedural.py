@@ -183,13 +183,13 @@ def test_varied_lenses_are_those_of_the_pictures():
 
 def test_handheld_cameras_turn_roll_and_look_from_above():
     options = jax.jit(procedural.handheld_cameras, static_argnums=1)
-    scenes = [_scenes(np.int32(seed), _plain_textures()) for seed in range(40)]
+    scenes = [_scenes(np.int32(seed), _plain_textures()) for seed in range(24)]
     path = jax.jit(lambda seed, scene, how: camera_path(seed, 6, scene=scene, **how)["c2w"])
     rolled, down, orbit = [], [], []
     for seed, scene in enumerate(scenes):
         how = options(np.int32(seed), 6)
         with_roll = np.asarray(path(np.int32(seed), scene, how), np.float64)
-        without = np.asarray(path(np.int32(seed), scene, how | {"roll": 0.0}), np.float64)
+        without = np.asarray(path(np.int32(seed), scene, how | {"roll": np.zeros(6, np.float32)}), np.float64)
         np.testing.assert_allclose(with_roll[:, :3, 2:], without[:, :3, 2:], atol=1e-6)
         turn = np.swapaxes(without[:, :3, :3], 1, 2) @ with_roll[:, :3, :3]
         angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
@@ -197,7 +197,7 @@ def test_handheld_cameras_turn_roll_and_look_from_above():
         rolled.append(np.abs(angle).max())
         down.append(np.degrees(np.arcsin(-without[:, 2, 2])).max())
         orbit.append(float(how["sweep"][0]))
-    assert 3 < np.sum(np.array(rolled) > 12) < 25 and max(rolled) <= 70
+    assert 2 < np.sum(np.array(rolled) > 12) < 16 and max(rolled) <= 70
     assert max(down) > 45  # most paths elsewhere stay below 30
     low, high = procedural.HANDHELD_SWEEP
     assert low <= min(orbit) < 60 and 250 < max(orbit) <= high + 1e-3
