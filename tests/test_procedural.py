@@ -189,7 +189,9 @@ def test_handheld_cameras_turn_roll_and_look_from_above():
     for seed, scene in enumerate(scenes):
         how = options(np.int32(seed), 6)
         with_roll = np.asarray(path(np.int32(seed), scene, how), np.float64)
-        without = np.asarray(path(np.int32(seed), scene, how | {"roll": np.zeros(6, np.float32)}), np.float64)
+        without = np.asarray(
+            path(np.int32(seed), scene, how | {"roll": np.zeros(6, np.float32)}), np.float64
+        )
         np.testing.assert_allclose(with_roll[:, :3, 2:], without[:, :3, 2:], atol=1e-6)
         turn = np.swapaxes(without[:, :3, :3], 1, 2) @ with_roll[:, :3, :3]
         angle = np.degrees(np.arctan2(turn[:, 1, 0], turn[:, 0, 0]))
