@@ -330,6 +330,26 @@ def test_a_resumed_run_continues_bit_for_bit(tmp_path, optim):
     assert int(resumed["skipped"]) == 1
 
 
+def test_a_resumed_run_lowers_to_the_same_program(tmp_path, monkeypatch):
+    """So that the compilation cache knows it, and going on starts at once."""
+    jit, programs = jax.jit, []
+
+    def reading(f, **options):
+        step = jit(f, **options)
+
+        def call(*args):
+            programs.append(step.lower(*args).as_text())
+            return step(*args)
+
+        return call
+
+    monkeypatch.setattr(jax, "jit", reading)
+    with pytest.raises(PowerCut):
+        run(tmp_path, 3, batches=cut_at(2), save_every=1)
+    run(tmp_path, 3, save_every=1, resume=True)
+    assert len(programs) == 3 and len(set(programs)) == 1
+
+
 def test_log_lines_of_a_resumed_run_average_the_same_steps(tmp_path):
     """Also when checkpoints and log lines do not coincide."""
     settings = {"log_every": 4, "save_every": 5}

@@ -211,7 +211,9 @@ def train(
         trainable = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), trainable)
     state = initial_state(trainable, optimiser, optim)
     where = None
-    if mesh is not None:
+    if mesh is None:  # where a restored state lies: for XLA, one that lies nowhere is another program
+        state = jax.device_put(state, jax.local_devices()[0])
+    else:
         everywhere = sharding.replicated(mesh)
         where = sharding.state_shardings(state, specs, mesh), everywhere
         state = sharding.place(state, where[0])
