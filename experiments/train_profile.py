@@ -145,7 +145,7 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--out", type=Path, default=RESULTS)
     args = p.parse_args()
-    from roge_jax.entry import write_json
+    from roge_jax.folders import write_json
 
     found = profile(args.checkpoint, args.photos, args.repeats, args.seed)
     write_json(args.out, found)

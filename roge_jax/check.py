@@ -19,8 +19,9 @@ import numpy as np
 
 from roge_jax.data.matching import pose_agreement
 from roge_jax.data.scene import Scene, open_scene
-from roge_jax.entry import execute, number, one_of, plain
+from roge_jax.entry import execute, number, one_of
 from roge_jax.errors import UserError
+from roge_jax.folders import plain
 from roge_jax.geometry.cameras import (
     CONVENTIONS,
     Cameras,

@@ -13,7 +13,6 @@ import datetime
 import errno
 import hashlib
 import importlib.metadata
-import json
 import os
 import platform
 import re
@@ -357,28 +356,3 @@ def git_commit(folder: Path | None = None) -> str | None:
         ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None
-
-
-def write_json(file: Path, content: Any) -> None:
-    """JSON with one temporary name, so that the file is whole or absent. NaN and infinity become null."""
-    file = Path(file)
-    temporary = file.with_name(file.name + ".part")
-    temporary.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
-    temporary.replace(file)
-
-
-def plain(value: Any) -> Any:
-    """A value as JSON has it: arrays and tuples as lists, paths as text, NaN and infinity as null."""
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, Path):
-        return str(value)
-    return (
-        None
-        if isinstance(value, float) and (value != value or abs(value) == float("inf"))
-        else value
-    )

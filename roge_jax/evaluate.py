@@ -14,7 +14,7 @@ import numpy as np
 
 from .entry import number, one_of
 from .errors import UserError
-from .folders import output_file
+from .folders import output_file, write_json
 
 HELD_OUT = "procedural:1000000000..1000000049"
 
@@ -260,7 +260,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "metrics": image.SETTINGS,
     }
     document = report.build(settings, results, models=("generated", "rgb_head"))
-    report.write_json(args.out, document)
+    write_json(args.out, document)
     print(report.table(document))
     print(f"wrote {args.out}")
     if args.sheet:

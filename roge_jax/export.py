@@ -15,6 +15,7 @@ import json
 from pathlib import Path
 
 from .entry import number, one_of
+from .folders import put
 
 STYLES = ("diffusers", "peft", "framecrafter", "comfyui")
 FILES = {
@@ -183,7 +184,7 @@ def write_lora(tree, config, style: str, out: Path) -> None:
             "bias": "none",
         }
         (part / "adapter_config.json").write_text(json.dumps(adapter, indent=1) + "\n")
-    part.rename(out)
+    put(part, out)
     left = sorted({p.partition("/")[0] for p in flatten(tree)} - {"dit"})
     full = any(p.startswith("dit/patch_embed") for p in flatten(tree))
     print(

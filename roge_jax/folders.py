@@ -162,11 +162,37 @@ def keep_settings(
                     "same, or choose another --out."
                 )
         return before
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_suffix(".json.part")
-    temporary.write_text(json.dumps(whole, indent=1) + "\n")
-    put(temporary, file)
+    write_json(file, whole)
     return whole
+
+
+def write_json(file: str | Path, content: Any) -> None:
+    """Strict JSON, whole or absent: NaN and infinity become null, arrays lists, folders are made."""
+    file = Path(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+        put(temporary, file)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def plain(value: Any) -> Any:
+    """A value as JSON has it: arrays and tuples as lists, paths as text, NaN and infinity as null."""
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, Path):
+        return str(value)
+    return (
+        None
+        if isinstance(value, float) and (value != value or abs(value) == float("inf"))
+        else value
+    )
 
 
 def _resolved(out: Path) -> Path:

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from .entry import Clock, environment, number, one_of, run, write_json
+from .entry import Clock, environment, number, one_of, run
 from .errors import UserError
 from .fields import is_file
-from .folders import output_folder
+from .folders import output_folder, write_json
 
 SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
 RENDERED = 32  # views of a procedural scene

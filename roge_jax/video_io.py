@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from .errors import UserError
+from .folders import put
 
 FPS = 16  # of Wan2.1
 BT709 = 1  # the number of this colour standard in H.264 and in FFmpeg
@@ -179,8 +180,7 @@ def write_frames(folder: str | Path, frames: np.ndarray) -> list[str]:
     names = [
         write_png(part / f"{i:04d}.png", pixels).name for i, pixels in enumerate(to_uint8(frames))
     ]
-    shutil.rmtree(folder, ignore_errors=True)
-    part.rename(folder)
+    put(part, folder)
     return names
 
 

@@ -49,6 +49,7 @@ def pytest_configure(config):
 
 # Files by the time they take, longest first: `make test` deals out whole files, so that nothing is compiled twice.
 LONGEST = (
+    "train_recipe",
     "train_program",
     "notebooks",
     "procedural",
@@ -93,3 +94,20 @@ def dev_data() -> Path:
             "needs developer data (too large for the repository): set ROGE_DEV_DATA to its folder"
         )
     return root
+
+
+@pytest.fixture(scope="module")
+def common():
+    """Options of a short training run of `tiny`, see `train_runs.quick_tiny`."""
+    from train_runs import quick_tiny
+
+    with quick_tiny() as options:
+        yield options
+
+
+@pytest.fixture
+def cheap(monkeypatch):
+    """Training runs compile next to nothing, see `train_runs.make_cheap`."""
+    from train_runs import make_cheap
+
+    make_cheap(monkeypatch)

@@ -10,7 +10,7 @@ import pytest
 
 from roge_jax import entry
 from roge_jax.errors import UserError
-from roge_jax.folders import keep_settings, output_file, output_folder
+from roge_jax.folders import keep_settings, output_file, output_folder, write_json
 
 
 def program(main, *arguments):
@@ -287,8 +287,8 @@ class TestRecord:
     def test_json_is_strict_and_whole(self, tmp_path):
         import numpy as np
 
-        file = tmp_path / "run.json"
-        entry.write_json(
+        file = tmp_path / "new" / "run.json"
+        write_json(
             file,
             {"a": float("nan"), "b": np.float32(0.5), "c": np.eye(2), "d": (tmp_path, 1), 3: None},
         )
@@ -301,5 +301,5 @@ class TestRecord:
             "3": None,
         }
         with pytest.raises(TypeError):
-            entry.write_json(file, {"a": object()})
-        assert json.loads(file.read_text()) == content
+            write_json(file, {"a": object()})
+        assert json.loads(file.read_text()) == content and list(file.parent.iterdir()) == [file]

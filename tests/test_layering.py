@@ -27,9 +27,9 @@ ALLOWED = {
     "fusion": _BASE,
     "preview": _PARTS,
     "model": _PARTS | {"preview"},
-    "weights": _PARTS,
+    "weights": _PARTS | {"folders"},
     "data": _BASE | {"entry", "folders"},  # neither networks nor metrics; a program writes pools
-    "metrics": _BASE,
+    "metrics": _BASE | {"folders"},
     "checkpoint": _PARTS | {"model", "weights", "folders"},
     "cost": _PARTS | {"model"},
     "limits": _BASE,

@@ -1,6 +1,5 @@
 """Results document, intervals, table and contact sheet."""
 
-import json
 import math
 
 import numpy as np
@@ -90,21 +89,6 @@ def test_missing_numbers_are_listed_and_counted():
     assert "(n=2)" in report.table(out) and "missing: s2: generated psnr" in report.table(out)
     with pytest.raises(UserError, match="'s0' occurs twice"):
         report.build({}, [scenes[0], scenes[0]])
-
-
-def test_json_is_strict_atomic_and_round_trips(tmp_path):
-    scenes = [entry("a", generated={"psnr": np.float32(2.5), "n": np.int64(3), "bad": np.inf})]
-    path = tmp_path / "new" / "results.json"
-    report.write_json(path, report.build({"depths": np.array([1.0, np.nan])}, scenes, resamples=10))
-    text = path.read_text()
-    assert "NaN" not in text and "Infinity" not in text
-    read = json.loads(text)
-    assert read["scenes"][0]["generated"] == {"psnr": 2.5, "n": 3, "bad": None}
-    assert read["settings"]["depths"] == [1.0, None]
-    assert read["intervals"]["generated"]["psnr"]["low"] is None
-    with pytest.raises(TypeError):
-        report.write_json(path, {"object": object()})
-    assert path.read_text() == text and list(path.parent.iterdir()) == [path]
 
 
 def test_table_marks_the_best_and_shows_the_differences():

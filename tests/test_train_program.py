@@ -2,16 +2,14 @@
 
 import dataclasses
 import functools
-import itertools
 import json
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
-from test_sharding import small
+from train_runs import losses, run, write_pool
 
 from roge_jax import config, entry, model, train
 from roge_jax.checkpoint import load_model, model_fingerprint, save_model
@@ -21,68 +19,6 @@ from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.folders import BLOCK_BYTES, BLOCKS, fingerprint
 from roge_jax.training import diagnose, loop, stages
-
-
-def run(*arguments) -> None:
-    train.main(train.parser().parse_args([str(a) for a in arguments]))
-
-
-def losses(folder) -> list[float]:
-    return [json.loads(line)["loss"] for line in (folder / "log.jsonl").read_text().splitlines()]
-
-
-@pytest.fixture(scope="module")
-def common():
-    """Options of a short run, made quick to compile: `tiny` with a smaller VAE, two contexts in every batch."""
-    smaller, lora_stage = small(), stages.lora_stage
-
-    def two_contexts(*arguments, **options):
-        stage = lora_stage(*arguments, **options)
-        views = dataclasses.replace(stage.views, contexts=(2,), context_weights=(1.0,))
-        return dataclasses.replace(stage, views=views)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(config.PRESETS, "tiny", lambda: smaller)
-        patch.setattr(stages, "lora_stage", two_contexts)
-        yield ["tiny", "--devices", 1, "--log-every", 1, "--save-every", 1]
-
-
-@pytest.fixture
-def cheap(monkeypatch):
-    """Objectives that move every leaf by what the batch shows, plain steps, no measuring: quick to compile, and the
-    program, the loop and the checkpoints around them are real.
-    """
-
-    def objective(trainable, frozen, batch, key, *, config, stage):
-        level = batch["target_rgb"].mean() + 0.1 * jax.random.uniform(key)
-        loss = sum(jnp.square(x - level).sum() for x in jax.tree.leaves(trainable))
-        return loss, {"flow": loss}
-
-    monkeypatch.setattr(loop, "make_optimiser", lambda optim, specs, steps: optax.sgd(1e-3))
-    for name in stages.OBJECTIVES:
-        monkeypatch.setitem(stages.OBJECTIVES, name, objective)
-    monkeypatch.setattr(stages, "measure_latents", lambda params, source, cfg, seed: cfg)
-    monkeypatch.setattr(stages, "measure_features", lambda params, source, cfg, seed: (params, cfg))
-
-
-def write_pool(folder, size, seed=0, frames=12):
-    """Two sequences of noise [frames, height, width] that move sideways."""
-    rng, (height, width) = np.random.default_rng(seed), size
-    folder.mkdir(parents=True)
-    rgb = rng.integers(0, 256, (2, frames, height, width, 3), np.uint8)
-    np.save(folder / "shard_00000.rgb.npy", rgb)
-    c2w = np.tile(np.eye(4), (2, frames, 1, 1))
-    c2w[..., 0, 3] = 0.1 * np.arange(frames)
-    K = np.tile([[height, 0, width / 2], [0, height, height / 2], [0, 0, 1.0]], (2, frames, 1, 1))
-    np.savez(folder / "shard_00000.npz", seeds=np.arange(2), K=K, c2w=c2w)
-    return folder
-
-
-def same(a, b, prefix="") -> bool:
-    """Whether two models have the same leaves, bit for bit; of those whose path starts with `prefix`."""
-    a, b = ({p: x for p, x in flatten(t).items() if p.startswith(prefix)} for t in (a, b))
-    assert a.keys() == b.keys() and a
-    return all(np.array_equal(a[path], b[path]) for path in a)
 
 
 def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
@@ -352,108 +288,6 @@ def test_a_fingerprint_tells_contents_and_nothing_else(tmp_path):
         large[place] = 1
         seen.add(fingerprint([("x", large)]))
     assert len(seen) == 5
-
-
-# The whole recipe, and the paper's stages at its end.
-
-
-@pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_all_stages_run_and_go_on_after_an_interruption(
-    real, common, tmp_path, monkeypatch, request
-):
-    if not real:
-        request.getfixturevalue("cheap")
-    pool = write_pool(tmp_path / "pool", (64, 96))
-    options = [*common, "--stage", "all", "--data", pool, "--steps", 2, "--batch", 1]
-    run(*options, "--out", tmp_path / "whole")
-    cfg = config.preset("tiny")
-    recipe = [s.name for s in stages.mini_stages() if not s.lookup]
-    order = [*recipe, "lora", "hires"]
-    assert {p.name for p in (tmp_path / "whole").iterdir()} == set(order)
-    whole = {name: load_model(tmp_path / "whole" / name / "model") for name in order}
-    assert {c.height for name, (_, c) in whole.items() if name != "hires"} == {cfg.height}
-    assert (whole["hires"][1].height, whole["hires"][1].width) == (2 * cfg.height, 2 * cfg.width)
-    recon = [(c.recon_height, c.recon_width) for _, c in (whole["lora"], whole["hires"])]
-    assert recon[0] == recon[1] == (cfg.recon_height, cfg.recon_width)  # Sec. 3.3
-    for before, after in itertools.pairwise(order):  # each goes on from the one before
-        assert not same(whole[before][0], whole[after][0])
-        held = json.loads((tmp_path / "whole" / after / "settings.json").read_text())
-        assert held["start"] == str(tmp_path / "whole" / before / "model")
-    adapter = json.loads((tmp_path / "whole/hires/adapter/config.json").read_text())
-    assert adapter["provenance"]["base"] == str(tmp_path / "whole/lora/model")
-
-    draw, trained = stages.stage_batch, []
-
-    def interrupted(source, stage, *rest):
-        if (stage.name, rest[2]) == ("lora", 1) and not trained.count("again"):
-            raise KeyboardInterrupt
-        trained.append(stage.name)
-        return draw(source, stage, *rest)
-
-    monkeypatch.setattr(stages, "stage_batch", interrupted)
-    for name in recipe:
-        shutil.copytree(tmp_path / "whole" / name, tmp_path / "again" / name)
-    with pytest.raises(KeyboardInterrupt):
-        run(*options, "--out", tmp_path / "again", "--resume")
-    assert set(trained) == {"lora"} and not (tmp_path / "again/lora/model").exists()
-    trained[:] = ["again"]
-    run(*options, "--out", tmp_path / "again", "--resume")
-    assert trained == [
-        "again",
-        "lora",
-        "hires",
-        "hires",
-    ]  # the second step of lora, and what follows
-    for name in order:
-        params, found = load_model(tmp_path / "again" / name / "model")
-        assert same(params, whole[name][0]) and found == whole[name][1], name
-    with pytest.raises(UserError, match="holds a run with seed 0, and 1 is asked for"):
-        run(*options, "--out", tmp_path / "again", "--resume", "--seed", 1)
-
-
-def test_crops_fit_into_the_pictures():
-    sides = {}
-    for name, words in (("tiny", []), ("mini", []), ("mini", ["--size", "48x64"])):
-        args = train.parser().parse_args([name, "--stage", "all", *words])
-        _, chosen = train.choose(args, config.preset(name))
-        sides[name, *words] = {stage.crop for stage in chosen if stage.crop}
-    assert list(sides.values()) == [{32}, {64}, {48}]
-
-
-def test_all_refuses_a_pool_that_its_last_stage_cannot_use_before_the_first(common, tmp_path):
-    pool = write_pool(tmp_path / "pool", (32, 48))
-    with pytest.raises(UserError, match=r"Stage hires: .* 32x48 and this stage trains at 64x96"):
-        run(*common, "--stage", "all", "--data", pool, "--out", tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_hires_leaves_the_reconstruction_bit_for_bit(common, cheap, tmp_path):
-    cfg = config.preset("tiny")
-    start = model.init(jax.random.key(0), cfg)
-    save_model(tmp_path / "start", start, cfg, dtype=jnp.float32)
-    pool = write_pool(tmp_path / "pool", (64, 96))
-    given = ["--init", tmp_path / "start", "--data", pool, "--steps", 1]
-    found = {}
-    for stage, size in (("lora", []), ("hires", [])):
-        run(*common, "--stage", stage, *given, *size, "--out", tmp_path / "out")
-        found[stage], _ = load_model(tmp_path / "out" / stage / "model")
-    for part in ("encoder", "renderer"):
-        assert same(found["hires"], start, part)
-        assert not same(found["lora"], start, part)  # which the same objective moves where it may
-    assert same(found["hires"], start, "vae")
-    for part in ("dit/blocks/self_attn/q", "dit/patch_embed", "fusion"):
-        assert not same(found["hires"], start, part)
-
-
-@pytest.mark.parametrize("name", ["recon", "lora", "hires", "all"])
-def test_scale_multiplies_the_steps_of_any_stage(name):
-    def steps(*words):
-        args = train.parser().parse_args(["tiny", "--stage", name, *words])
-        return [stage.steps for stage in train.choose(args, config.preset("tiny"))[1]]
-
-    assert steps("--scale", "0.5") == [n / 2 for n in steps()]
-    assert set(steps("--scale", "1e-6")) == {1}
-    assert set(steps("--scale", "0.5", "--steps", "7")) == {7}
 
 
 # Options that only look, or save memory.

@@ -20,6 +20,7 @@ import numpy as np
 from roge_jax.data.scene import Scene, load_scene, prepare
 from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
+from roge_jax.folders import put
 
 
 def runs(views: int, frames: int) -> list[int]:
@@ -46,12 +47,12 @@ def pack_scene(scene: Scene, stem: Path, *, frames: int, height: int, width: int
         images, cameras = prepare(scene, ids, height, width, drop_duplicates=False)
         rgb[row], K[row] = np.round(images * 255.0), cameras.K
     rgb.flush()
-    part.rename(part.with_suffix(""))
+    put(part, part.with_suffix(""))
     c2w = np.stack([scene.cameras.c2w[start : start + frames] for start in starts])
     part = stem.with_suffix(".npz.part")
     with part.open("wb") as file:
         np.savez(file, seeds=np.arange(len(starts)), K=K, c2w=c2w)
-    part.rename(part.with_suffix(""))
+    put(part, part.with_suffix(""))
     return len(starts)
 
 
@@ -83,7 +84,7 @@ def pack(
     except BaseException:  # one scene that cannot be read: nothing half-written stays
         shutil.rmtree(part, ignore_errors=True)
         raise
-    part.rename(out)
+    put(part, out)
     return total
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
 from roge_jax.fields import read_json
-from roge_jax.folders import output_file
+from roge_jax.folders import output_file, put
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,11 +210,11 @@ def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
     for name, store in maps.items():
         store.flush()
         part = stem.with_suffix(f".{name}.npy.part")
-        part.rename(part.with_suffix(""))
+        put(part, part.with_suffix(""))
     part = stem.with_suffix(".npz.part")
     with part.open("wb") as file:
         np.savez(file, seeds=seeds, K=np.stack(cameras["K"]), c2w=np.stack(cameras["c2w"]))
-    part.rename(part.with_suffix(""))
+    put(part, part.with_suffix(""))
     return stem.name, time.perf_counter() - began
 
 

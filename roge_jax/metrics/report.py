@@ -5,11 +5,8 @@ results are `{"settings", "means": {METHOD: {METRIC: value}}, "scenes": [...]}` 
 `differences` and `missing`, which say how far to trust the means.
 """
 
-import json
 import math
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -147,18 +144,6 @@ def build(
     }
 
 
-def write_json(path: str | Path, results: dict[str, Any]) -> None:
-    """Writes strict JSON (NaN and inf become null) under a temporary name, then renames it."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps(_plain(results), indent=1, allow_nan=False) + "\n")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def table(results: dict[str, Any], metrics: Sequence[str] | None = None) -> str:
     """Readable text: a row per method, a column per metric (mean [low, high]), then the differences.
 
@@ -255,23 +240,6 @@ def contact_sheet(
 
 def _ordered(names: Any) -> list[str]:
     return list(dict.fromkeys(names))
-
-
-def _plain(x: Any) -> Any:
-    """NumPy and non-finite numbers to what JSON has."""
-    if isinstance(x, dict):
-        return {str(k): _plain(v) for k, v in x.items()}
-    if isinstance(x, (list, tuple)):
-        return [_plain(v) for v in x]
-    if isinstance(x, np.ndarray):
-        return _plain(x.tolist())
-    if isinstance(x, (bool, np.bool_)):
-        return bool(x)
-    if isinstance(x, np.integer):
-        return int(x)
-    if isinstance(x, (float, np.floating)):
-        return float(x) if math.isfinite(x) else None
-    return x
 
 
 def _cell(one: dict[str, float] | None, scenes: int, signed: bool = False) -> str:

@@ -211,7 +211,8 @@ def train(
         trainable = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), trainable)
     state = initial_state(trainable, optimiser, optim)
     where = None
-    if mesh is None:  # where a restored state lies: for XLA, one that lies nowhere is another program
+    if mesh is None:
+        # Where a restored state lies: one that lies nowhere would be another program to XLA.
         state = jax.device_put(state, jax.local_devices()[0])
     else:
         everywhere = sharding.replicated(mesh)

@@ -21,6 +21,7 @@ import numpy as np
 from ..config import RoGeConfig, VAEConfig, to_dict
 from ..core.params import Spec, flatten, init, unflatten
 from ..errors import UserError
+from ..folders import put
 from ..video.dit import FLOAT32_LEAVES
 from ..video.vae_training import passthrough_init
 from .mapping import Entry, source_shapes
@@ -229,7 +230,7 @@ def write(
     (part / "config.json").write_text(json.dumps(config, indent=1) + "\n")
     (part / PLAN).unlink()
     (part / PROGRESS).unlink(missing_ok=True)
-    part.rename(out)
+    put(part, out)
 
 
 def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray]]]:
