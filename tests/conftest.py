@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import quick_xla
 
 ROOT = Path(__file__).parent.parent
 HOST_DEVICES = 8
@@ -24,17 +25,13 @@ _SETTINGS = {
     "OPENBLAS_NUM_THREADS": "1",
     "MPLBACKEND": "Agg",
 }
-# Compiling is most of the time on small shapes: level 0 takes a third less than level 1, with equal parity errors.
-_XLA_FLAGS = {
-    "xla_force_host_platform_device_count": HOST_DEVICES,
-    "xla_backend_optimization_level": 0,
-}
+_XLA_FLAGS = quick_xla.FLAGS | {quick_xla.DEVICES: str(HOST_DEVICES)}
 
 for name, value in _SETTINGS.items():
     os.environ.setdefault(name, value)
 given = os.environ.get("XLA_FLAGS", "")
-missing = [f"--{flag}={value}" for flag, value in _XLA_FLAGS.items() if flag not in given]
-os.environ["XLA_FLAGS"] = " ".join([given, *missing]).strip()
+missing = {flag: value for flag, value in _XLA_FLAGS.items() if flag not in given}
+os.environ["XLA_FLAGS"] = f"{given} {quick_xla.spelled(missing)}".strip()
 
 sys.path.insert(0, str(Path(__file__).parent))  # helper modules beside the tests
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import distributed_worker
 import numpy as np
 import pytest
+from quick_xla import DEVICES, FLAGS, spelled
 
 from roge_jax.core.distributed import launch_arguments
 from roge_jax.errors import UserError
@@ -37,7 +38,7 @@ def start(
             "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}",
             "JAX_NUM_PROCESSES": str(count),
             "JAX_PROCESS_ID": str(index),
-            "XLA_FLAGS": f"--xla_force_host_platform_device_count={data * fsdp // count}",
+            "XLA_FLAGS": spelled(FLAGS | {DEVICES: str(data * fsdp // count)}),
             "PYTHONPATH": str(WORKER.parent.parent),
         }
         command = [sys.executable, str(WORKER), str(out), str(data), str(fsdp), "6", *options]

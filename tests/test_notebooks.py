@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import quick_xla
 
 # "In under a minute" is for a machine of one's own. Machines for tests have one or two slow cores, shared with other tests.
 MOST_SECONDS = 180
@@ -14,7 +15,7 @@ NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs(source, tmp_path):
-    environment = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    environment = os.environ | {"XLA_FLAGS": quick_xla.spelled()}
     done = subprocess.run(
         [sys.executable, str(source)],
         cwd=tmp_path,

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import quick_xla
 from scene_files import nerfstudio, truth
 
 from roge_jax import entry, evaluate, train
@@ -35,7 +36,7 @@ def commands() -> list[str]:
 
 
 def run(arguments, folder) -> subprocess.CompletedProcess:
-    environment = os.environ | {"XLA_FLAGS": "--xla_backend_optimization_level=0"}
+    environment = os.environ | {"XLA_FLAGS": quick_xla.spelled()}
     return subprocess.run(
         [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True
     )
