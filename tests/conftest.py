@@ -9,9 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
-import quick_xla
 
 ROOT = Path(__file__).parent.parent
+sys.path.insert(0, str(ROOT / "tests"))  # helper modules beside the tests
+
+import quick_xla  # noqa: E402
+
 HOST_DEVICES = 8
 
 assert "jax" not in sys.modules, "a pytest plugin imported jax before its settings were made"
@@ -32,8 +35,6 @@ for name, value in _SETTINGS.items():
 given = os.environ.get("XLA_FLAGS", "")
 missing = {flag: value for flag, value in _XLA_FLAGS.items() if flag not in given}
 os.environ["XLA_FLAGS"] = f"{given} {quick_xla.spelled(missing)}".strip()
-
-sys.path.insert(0, str(Path(__file__).parent))  # helper modules beside the tests
 
 
 def pytest_configure(config):
