@@ -149,6 +149,12 @@ def test_a_patch_convolution_equals_the_convolution():
 # Attention and rotary tables.
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def output_and_gradients(f, *args):
+    y, pull = jax.vjp(f, *args)
+    return y, pull(jnp.cos(args[0]))
+
+
 @pytest.mark.parametrize(("lead", "q_len", "kv_len"), [((3,), 4, 9), ((2, 3), 7, 2)])
 def test_attention_equals_jax_nn(lead, q_len, kv_len):
     q, k, v = (normal(*lead, n, 2, 8, seed=n) for n in (q_len, kv_len, kv_len))
@@ -157,15 +163,51 @@ def test_attention_equals_jax_nn(lead, q_len, kv_len):
         flat = [x.reshape(-1, *x.shape[-3:]) for x in (q, k, v)]
         return jax.nn.dot_product_attention(*flat).reshape(q.shape)
 
-    @functools.partial(jax.jit, static_argnums=0)
-    def output_and_gradients(f, *args):
-        y, pull = jax.vjp(f, *args)
-        return y, pull(jnp.cos(args[0]))
-
     (y, got), (want, ref) = (output_and_gradients(f, q, k, v) for f in (attention, reference))
     assert rel_l2(y, want) < 2 * FLOAT32
     for a, b in zip(got, ref, strict=True):
         assert rel_l2(a, b) < 1e-5  # differences of near-equal terms
+
+
+LENGTHS = [(6, 8), (7, 8), (6, 9), (7, 9)]
+
+
+@pytest.mark.parametrize("lengths", LENGTHS)
+def test_what_the_fused_kernel_is_told_gives_the_same_attention(monkeypatch, lengths):
+    """Its arguments, given to the formulation of `jax.nn` that runs anywhere: values and gradients."""
+    q, k, v = (normal(2, n, 3, 8, seed=i) for i, n in enumerate((lengths[0], *2 * lengths[1:])))
+    want = output_and_gradients(attention, q, k, v)  # on the backend that there is
+    library, calls = jax.nn.dot_product_attention, []
+
+    def anywhere(*args, implementation, **options):
+        calls.append({"implementation": implementation} | options)
+        return library(*args, implementation="xla", **options)
+
+    monkeypatch.setattr(jax.nn, "dot_product_attention", anywhere)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    found = output_and_gradients(functools.partial(attention, dtype=jnp.bfloat16), q, k, v)
+    assert [call["implementation"] for call in calls] == ["cudnn"]
+    assert ("key_value_seq_lengths" in calls[0]) == any(n % 2 for n in lengths)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(want), strict=True):
+        assert a.shape == b.shape and rel_l2(a, b) < 2e-2  # bfloat16
+
+
+@pytest.mark.parametrize("lengths", LENGTHS)
+def test_the_fused_kernel_has_a_gradient_at_any_length(monkeypatch, lengths):
+    """Lowered for a GPU that is not there, one prompt for several videos: odd lengths, and keys without their own batch
+    axis, are what JAX refuses."""
+    fused = pytest.importorskip("jax._src.cudnn.fused_attention_stablehlo")
+    monkeypatch.setattr(fused, "check_cudnn_version", lambda: 91200)
+    monkeypatch.setattr(fused, "check_compute_capability", lambda *_: True)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    q, k = normal(2, lengths[0], 4, 64), normal(lengths[1], 4, 64)
+
+    def loss(q, k):
+        y = jax.vmap(lambda q: attention(q, k, 2 * k, dtype=jnp.bfloat16))(q)
+        return y.sum()
+
+    program = jax.jit(jax.grad(loss, (0, 1))).trace(q, k).lower(lowering_platforms=("cuda",))
+    assert "__cudnn$fmha" in program.as_text() and "Backward" in program.as_text()
 
 
 def test_attention_survives_large_logits():

@@ -26,7 +26,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
     if jax.default_backend() == "gpu" and dtype == jnp.bfloat16:
         lead = q.shape[:-3]
         q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
-        y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn")
+        y = _fused(q, k, v, scale)
         return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
     q = jnp.swapaxes(q * scale, -3, -2).astype(dtype)
     k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (k, v))
@@ -51,6 +51,25 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
         y = jnp.moveaxis(jax.lax.map(jax.checkpoint(some), q), 0, -3)
         y = y.reshape(*outer, pieces * size, v.shape[-1])[..., :length, :]
     return checkpoint_name(jnp.swapaxes(y, -3, -2), "attention")
+
+
+def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
+    """The cuDNN kernel on q [b, l, k, e] and k, v [b, s, k, e].
+
+    JAX refuses odd lengths as soon as a gradient is asked for: such a length is padded by one that the kernel is told
+    to leave out.
+    """
+    lengths, batch = (q.shape[1], k.shape[1]), q.shape[:1]
+    # Always x, with the batch axes that `jax.vmap` gave q alone: JAX 0.10 knows no other batches.
+    k, v = (jnp.where(True, x, q[:, :1]) for x in (k, v))
+    told = {}
+    if any(n % 2 for n in lengths):
+        q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (q, k, v))
+        own = q[:, 0, 0, 0].astype(jnp.int32)
+        queries, keys = (jnp.where(True, jnp.full(batch, n, jnp.int32), own) for n in lengths)
+        told = {"query_seq_lengths": queries, "key_value_seq_lengths": keys}
+    y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn", **told)
+    return y[:, : lengths[0]]
 
 
 @contextlib.contextmanager
