@@ -93,7 +93,7 @@ def summarise(rows: list[dict]) -> dict:
         "worst_violation": float((realised / tolerances[None]).max()),
     }
     truth = points(rows, "planner", "truth")
-    made = np.array([[any(p["planner"]["generate"]) for p in row["plans"]] for row in rows])
+    made = np.array([[p["planner"]["generated"] == 1 for p in row["plans"]] for row in rows])
     for key, some in (("", np.ones_like(made)), ("_by_generated_video", made)):
         equal = [
             full[i] / needed(truth[i][some[i]], full[i], row["full"]["truth"])

@@ -34,7 +34,7 @@ def ladder(planner, *, predicted=None, tolerance=TOLERANCE, **controls):
         if found is None:
             return None
         gflop, error = found
-        return {"flops": gflop * 1e9, "full": error, "truth": 0.05 + error, "generate": [False]}
+        return {"flops": gflop * 1e9, "full": error, "truth": 0.05 + error, "generated": 0.0}
 
     rows = []
     for i, own in enumerate(planner):
@@ -209,8 +209,8 @@ def test_uniform_plans_use_any_number_of_photos_and_never_exceed_the_budget(engi
     assert none[0] and not none[-1] and none == sorted(none, reverse=True)
     plans = [(plan, budget) for plan, budget in zip(found, budgets, strict=True) if plan]
     assert all(flops <= budget for (flops, _), budget in plans)
-    generated = [choices for (_, choices), _ in plans if choices.generate[0]]
-    shown = [choices for (_, choices), _ in plans if not choices.generate[0]]
+    generated = [choices for (_, choices), _ in plans if choices.generated]
+    shown = [choices for (_, choices), _ in plans if not choices.generated]
     assert {len(c.photos) for c in generated} == set(range(1, CONTEXTS + 1))
     assert {len(c.photos) for c in shown} == set(range(1, CONTEXTS + 1))
     assert all(len(set(c.photos)) == len(c.photos) for c in generated + shown)
@@ -221,7 +221,7 @@ def test_a_fixed_plan_is_the_best_predicted_within_its_budget(engine, scene):
     def option(photos, error, flops, **changes):
         return Option(engine.choices(scene, photos=photos, **changes), error, flops)
 
-    head = {"generate": (False,)}
+    head = {"generate": (None,)}
     listed = [
         [option((0, 1), 0.01, 50.0), option((0,), 0.03, 30.0), option((0, 1), 0.04, 20.0, **head)],
         [option((2, 5), 0.05, 50.0), option((3,), 0.05, 30.0), option((1, 4), 0.03, 20.0, **head)],
@@ -231,18 +231,18 @@ def test_a_fixed_plan_is_the_best_predicted_within_its_budget(engine, scene):
     kinds = {50.0: (2, True), 49.9: (2, False), 20.0: (2, False), 19.9: None}
     for budget, expected in kinds.items():
         found = plan_ladder.fixed_plan(listed, budget)
-        assert (found and (len(found.photos), found.generate[0])) == expected
+        assert (found and (len(found.photos), found.generated > 0)) == expected
 
 
 def test_random_plans_are_drawn_from_just_below_the_budget(engine, scene):
     costs = (10.0, 84.0, 86.0, 95.0, 100.0, 101.0)
     listed = [Option(engine.choices(scene, photos=(i,)), 0.0, c) for i, c in enumerate(costs)]
     rng = np.random.default_rng(0)
-    drawn = [plan_ladder.random_plan(scene, listed, 100.0, rng) for _ in range(60)]
+    drawn = [plan_ladder.random_plan(engine, scene, listed, 100.0, rng) for _ in range(60)]
     assert {flops for flops, _ in drawn} == {86.0, 95.0, 100.0}
     assert len({choices.photos for _, choices in drawn}) == CONTEXTS
-    assert plan_ladder.random_plan(scene, listed, 60.0, rng)[0] == 10.0
-    assert plan_ladder.random_plan(scene, listed, 9.0, rng) is None
+    assert plan_ladder.random_plan(engine, scene, listed, 60.0, rng)[0] == 10.0
+    assert plan_ladder.random_plan(engine, scene, listed, 9.0, rng) is None
 
 
 def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
@@ -251,7 +251,8 @@ def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
     """Runs are faked: each photo, step and picture left out adds an error."""
 
     def run(scene, choices):
-        lost = CONTEXTS - len(choices.photos) + choices.merge + 10 * (not choices.generate[0])
+        lost = CONTEXTS - len(choices.photos) + choices.merge
+        lost += 10 * (1 - choices.generated / len(scene.path))
         return scene.truth + np.float32(1e-3 * (lost + 20 * (choices.recon != whole.recon)))
 
     whole = engine.choices(scene)

@@ -34,6 +34,7 @@ TABLE = table.parse(
         **{"photos": 0.12, "photos_head": 0.13},
         **{"merge": {2: 0.01, 4: 0.02}, "merge_head": {2: 0.01, 4: 0.02}},
         **{"half": 0.03, "half_head": 0.04, "head": 0.08},
+        **{"seen": {"rise": 2.0, "typical": 0.5}, "stretch": {0.25: 0.04, 0.75: 0.02}},
         "knobs": {
             "photos": [{"proxy": "leave_one_out", "typical": 0.1, "power": 1.0}],
             "steps": [
@@ -42,6 +43,7 @@ TABLE = table.parse(
             ],
             "merge": [{"proxy": "redundancy", "typical": 0.3, "power": 1.0}],
             "half": [],
+            "stretch": [],
             "head": [{"proxy": "detail", "typical": 0.05, "power": 0.5}],
         },
         "provenance": {},
