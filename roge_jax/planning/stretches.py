@@ -26,9 +26,12 @@ class Cut(NamedTuple):
 
 
 def lengths(config: RoGeConfig) -> list[int]:
-    """Frames that may be generated together: a quarter, half, three quarters and all of a window's slots, and the first."""
-    slots = (config.frames - 1) // GROUP
-    return sorted({1 + GROUP * round(part * slots / 4) for part in (1, 2, 3, 4)})
+    """Frames that may be generated together: one and a quarter, half, three quarters or all of a window's groups of four.
+
+    Never one alone: it would be as far from the full model's frame as the RGB head's picture is.
+    """
+    groups = (config.frames - 1) // GROUP
+    return sorted({1 + GROUP * min(groups, max(1, round(k * groups / 4))) for k in (1, 2, 3, 4)})
 
 
 def places(window: Span, length: int) -> list[Span]:
