@@ -19,6 +19,8 @@ from roge_jax.video import flow, solvers
 from roge_jax.windows import stretch_noise, window_views
 
 CONTEXTS = 6
+# Of 17 frames: where the planner generates nothing alone, and why.
+ELSEWHERE = {"between slots": ((2, 7), (10, 15)), "one frame": ((4, 5), (12, 13))}
 RUNGS = ("plane", "empty", "3 objects", "6 objects", "12 objects", "clutter")
 KEPT = {"plane": (), "empty": (), "3 objects": (2, 6, 9), "6 objects": (2, 3, 6, 7, 9, 10)}
 
@@ -251,6 +253,10 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     row["stretch"] = {
         length: [_alone(engine, scene, full, place) for place in stretches.places(window, length)]
         for length in stretches.lengths(engine.config)[:-1]
+    }
+    row["elsewhere"] = {
+        name: [_alone(engine, scene, full, place) for place in places]
+        for name, places in ELSEWHERE.items()
     }
     row["half"] = both(recon=(small.recon_height, small.recon_width))
     size = (engine.config.height, engine.config.width)
