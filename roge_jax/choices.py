@@ -50,7 +50,8 @@ def spans(plan: Planned | None, windows: list[Span], length: int) -> tuple[list[
         )
     found = [span or (start, start) for span, (start, _) in zip(generate, windows)]
     for (first, last), (start, stop) in zip(found, windows, strict=True):
-        if not start <= first <= last <= min(stop, first + length) or (first - start) % GROUP:
+        whole = min(stop, first + length)  # as far as a stretch goes that begins there
+        if not start <= first <= last or last not in (first, whole) or (first - start) % GROUP:
             raise UserError(
                 f"The plan generates frames {first} to {last - 1}, {length} at a time, in a window of the frames "
                 f"{start} to {stop - 1}: plan again for this path."

@@ -292,8 +292,9 @@ def sample(
         if rest:
             told[-1]["rgb_head"] = [[a, b - 1] for a, b in rest]
         see = functools.partial(window_views, images, recon, contexts, info=info, config=config)
-        part, views = config, [see(target[start:stop])]
-        if first < last:
+        if first == last:
+            part, views = config, [see(target[start:stop])]
+        else:
             part = dataclasses.replace(config, frames=length)
             views = [see(target[first:last], frames=length)]
             if shown:

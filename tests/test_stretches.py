@@ -97,12 +97,12 @@ def test_stretches_begin_where_slots_end_and_have_one_length():
     assert stretches.lengths(config) == [5, 9, 13, 17]
     assert stretches.lengths(dataclasses.replace(CONFIG, frames=81)) == [21, 41, 61, 81]
     assert stretches.places((17, 34), 9) == [(17, 26), (21, 30), (25, 34)]
-    assert stretches.places((34, 40), 5) == [(34, 39)] and stretches.places((34, 37), 5) == [
-        (34, 37)
-    ]
+    assert stretches.places((34, 40), 5) == [(34, 39), (38, 40)]
+    assert stretches.places((34, 37), 5) == [(34, 37)] == stretches.places((34, 37), 17)
+    assert stretches.places((17, 34), 17) == [(17, 34)]
     seen = np.full(40, 0.9)
     seen[20:24] = 0.1  # of the second window
-    seen[38] = 0.5
+    seen[39] = 0.5
     assert stretches.place(seen, (17, 34), 5) == (21, 26)
     first, *more = stretches.cuts(seen, config)
     assert first == ((None, None, None), 17) and more[-1] == (((0, 17), (17, 34), (34, 40)), 17)
@@ -154,6 +154,8 @@ def test_frames_outside_a_stretch_are_the_rgb_heads_bit_for_bit(run, path):
     middle = run(path[:7], ((0, 5),), 5)
     np.testing.assert_allclose(middle.preview, head.preview[:7], atol=1e-5)
     assert middle.windows[0]["rgb_head"] == [[5, 6]] and len(middle.frames) == 7
+    end = run(path[:7], ((4, 7),), 5)  # padded to five
+    assert end.windows[0]["rgb_head"] == [[0, 3]] and len(end.frames) == 7
 
 
 def test_frames_inside_equal_sampling_the_stretch_alone(weights, run, photos, path, monkeypatch):
@@ -189,7 +191,7 @@ def test_windows_are_chained_through_generated_and_other_frames(run, photos, wei
 
 
 def test_plans_for_other_paths_are_refused(run, path):
-    for generate, frames in ((((0, 9),), 9), (((4, 9),), 5), (((1, 6),), 5), (((0, 6),), 5)):
+    for generate, frames in ((((0, 9),), 9), (((4, 9),), 5), (((1, 6),), 5), (((0, 3),), 5)):
         with pytest.raises(UserError, match="plan again for this path") as error:
             run(path[:7], generate, frames)
         assert "\n" not in str(error.value)

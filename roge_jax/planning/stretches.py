@@ -35,9 +35,9 @@ def lengths(config: RoGeConfig) -> list[int]:
 
 
 def places(window: Span, length: int) -> list[Span]:
-    """Where in a window [start, stop) `length` frames can be generated alone; all of it, if it has no more."""
+    """Where in a window [start, stop) `length` frames can be generated alone, or fewer at its end."""
     start, stop = window
-    firsts = range(start, max(start, stop - length) + 1, GROUP)
+    firsts = range(start, max(start + 1, stop - length + GROUP), GROUP)
     return [(first, min(first + length, stop)) for first in firsts]
 
 
