@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -14,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 import plan_ladder
 import plan_report
-from plan_runs import CONTEXTS, Engine, LadderScene, make, rms
+from plan_runs import CONTEXTS, Engine, LadderScene, make, rms, seen_less
 
 from roge_jax import checkpoint, model, sampling
 from roge_jax.config import preset
@@ -243,6 +244,38 @@ def test_random_plans_are_drawn_from_just_below_the_budget(engine, scene):
     assert len({choices.photos for _, choices in drawn}) == CONTEXTS
     assert plan_ladder.random_plan(engine, scene, listed, 60.0, rng)[0] == 10.0
     assert plan_ladder.random_plan(engine, scene, listed, 9.0, rng) is None
+
+
+def test_generated_frames_of_controls_stand_in_the_middle_or_anywhere(engine, scene):
+    wide = types.SimpleNamespace(config=dataclasses.replace(engine.config, frames=17))
+    choices = engine.choices(scene, generate=((12, 17),), frames=5)
+    rng = np.random.default_rng(0)
+    assert plan_ladder.placed(wide, choices) == ((8, 13),)
+    drawn = {plan_ladder.placed(wide, choices, rng) for _ in range(40)}
+    assert drawn == {((first, first + 5),) for first in (0, 4, 8, 12)}
+    assert plan_ladder.placed(wide, engine.choices(scene, generate=(None,)), rng) == (None,)
+
+
+def test_the_rise_of_the_heads_error_is_found_again():
+    rng = np.random.default_rng(0)
+    levels = (0.01, 0.02)
+    rows = []
+    for level in levels:
+        frames = []
+        for low in (0.7, 0.1):  # all photos, few of them
+            seen = rng.uniform(low, 1.0, 17)
+            frames.append({"seen": seen, "head": level * (1 + 2.5 * (1 - seen))})
+        head = np.sqrt(np.square(frames[0]["head"]).mean())
+        rows.append({"frames": frames, "head": head})
+    found, own = seen_less(rows)
+    assert found["rise"] == pytest.approx(2.5) and found["r"] == pytest.approx(1.0)
+    np.testing.assert_allclose(own, levels)
+    # A frame of typical coverage has the average of the levels times that of the growth.
+    average = np.sqrt(np.mean([row["head"] ** 2 for row in rows]))
+    typical = np.sqrt(np.square(levels).mean()) * (1 + 2.5 * (1 - found["typical"]))
+    assert typical == pytest.approx(average)
+    flat = [{"frames": [{"seen": f["seen"], "head": np.full(17, 0.01)} for f in row["frames"]], "head": 0.01} for row in rows]  # fmt: skip
+    assert seen_less(flat)[0] == {"rise": 0.0, "typical": 1.0}
 
 
 def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
