@@ -165,7 +165,7 @@ def words(summary: dict) -> str:
         f"{summary['scenes']} scenes. Predicted against realised error: {_rank(summary)}, "
         f"realised / predicted {middle:.2f} [{low:.2f}, {high:.2f}]",
         f"At the full model's error to the truth the median scene takes {saved['median_scene']:.2f} times less compute "
-        f"({made['median_scene']:.2f} times if the video must be generated)",
+        f"({made['median_scene']:.2f} times if every frame must be generated)",
     ]
     return "\n".join([*lines, *(_told(summary, name) for name in CONTROLS)])
 
