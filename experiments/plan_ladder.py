@@ -15,8 +15,9 @@ For every tolerance and scene the planner (`roge_jax.planning`) makes a plan; it
 Beside it stand controls that cost no more, never more:
   fixed    one plan for all scenes of a tolerance. Its budget is the mean of what the planner spends on them, planning
            included; within it, the plan whose predicted error (same table, mean over the scenes, each taken as one of
-           an average kind) is least. Photos spread (farthest point)
-  random   a plan drawn for each scene from all whose cost is within 15 % below the planner's, photos drawn too
+           an average kind) is least. Photos spread (farthest point), generated frames in the middle
+  random   a plan drawn for each scene from all whose cost is within 15 % below the planner's, photos and the place of
+           the generated frames drawn too
   uniform  for each scene, the most photos that the planner's cost pays for, evenly spread, steps cut by the same
            factor, uniform sigma grid; where that does not pay for a generated video the RGB head alone, where not for
            that either, the head at half size
@@ -40,7 +41,7 @@ from plan_runs import RUNGS, Engine, LadderScene, fit, make, rms, turn_knobs
 from roge_jax import checkpoint
 from roge_jax.data.procedural import HELDOUT_SEED
 from roge_jax.data.scene import select_context
-from roge_jax.planning import coverage, options, proxies, table
+from roge_jax.planning import coverage, options, proxies, stretches, table
 from roge_jax.planning.plan import plan
 from roge_jax.video import solvers
 
@@ -105,11 +106,19 @@ def every_option(engine: Engine, scene: LadderScene, measured: dict, constants) 
 
 
 def shape(choices) -> tuple:
-    """Choices without saying which photos: what a plan for all scenes can fix."""
-    return (len(choices.photos), *(getattr(choices, f) for f in FIELDS))
+    """Choices without saying which photos and which frames: what a plan for all scenes can fix."""
+    return (len(choices.photos), choices.generated, *(getattr(choices, f) for f in FIELDS))
 
 
-FIELDS = ("steps", "solver", "schedule", "recon", "merge", "generate")
+FIELDS = ("steps", "solver", "schedule", "recon", "merge", "frames")
+
+
+def placed(engine: Engine, choices, rng=None) -> tuple:
+    """`Choices.generate` with a stretch as long as that of `choices` in the middle of the window, or anywhere."""
+    if not choices.generated:
+        return (None,)
+    places = stretches.places((0, engine.config.frames), choices.generated)
+    return (places[len(places) // 2 if rng is None else rng.integers(len(places))],)
 
 
 def fixed_plan(listed: list[list], budget: float):
@@ -122,24 +131,27 @@ def fixed_plan(listed: list[list], budget: float):
     full = {k: v for k, v in errors.items() if len(v) == len(listed)}
     if not full:
         return None
-    best = min(full, key=lambda k: (np.mean(full[k]), k[:2]))
+    best = min(full, key=lambda k: (np.mean(full[k]), k[0], k[2]))
     return next(o.choices for o in listed[0] if shape(o.choices) == best)
 
 
-def random_plan(scene: LadderScene, listed: list, budget: float, rng):
-    """A plan drawn from those within 15 % below the budget, or the nearest below; its photos drawn too."""
+def random_plan(engine: Engine, scene: LadderScene, listed: list, budget: float, rng):
+    """A plan drawn from those within 15 % below the budget, or the nearest below; its photos and frames drawn too."""
     within = [o for o in listed if o.flops <= budget * plan_report.ROUNDING]
     if not within:
         return None
     near = [o for o in within if o.flops >= 0.85 * budget] or [max(within, key=lambda o: o.flops)]
     drawn = near[rng.integers(len(near))]
     photos = rng.permutation(len(scene.photos.ids))[: len(drawn.choices.photos)].tolist()
-    return drawn.flops, dataclasses.replace(drawn.choices, photos=tuple(sorted(photos)))
+    generate = placed(engine, drawn.choices, rng)
+    return drawn.flops, dataclasses.replace(
+        drawn.choices, photos=tuple(sorted(photos)), generate=generate
+    )
 
 
 def uniform_plans(engine: Engine, scene: LadderScene) -> list:
     """(FLOPs, choices), best first: photos and steps cut by one factor; then the RGB head, then at half size too."""
-    price = options.Prices(scene.photos, engine.config, engine.settings, 1)
+    price = options.Prices(engine.config, engine.settings, engine.config.frames)
     everything, steps = len(scene.photos.ids), engine.settings.steps
     counts = range(everything, 0, -1)
     spread = {m: tuple(int((i + 0.5) * everything / m) for i in range(m)) for m in counts}
@@ -152,7 +164,7 @@ def uniform_plans(engine: Engine, scene: LadderScene) -> list:
     small = proxies.half_size(engine.config)
     sizes = [{}] + [{"recon": (small.recon_height, small.recon_width)}] * bool(small)
     made += [
-        engine.choices(scene, photos=spread[m], generate=(False,), **size)
+        engine.choices(scene, photos=spread[m], generate=(None,), **size)
         for size in sizes
         for m in counts
     ]
@@ -200,7 +212,7 @@ def run_scene(engine: Engine, scene: LadderScene, listed: list, made: list, fixe
     price = {shape(o.choices): o.flops for o in listed}
     full = engine.choices(scene)
     reference = engine.run(scene, full)
-    head = engine.choices(scene, generate=(False,))
+    head = engine.choices(scene, generate=(None,))
     rng = np.random.default_rng(scene.seed)
     uniform = uniform_plans(engine, scene)
 
@@ -214,6 +226,8 @@ def run_scene(engine: Engine, scene: LadderScene, listed: list, made: list, fixe
             "full": rms(frames, reference),
             "truth": rms(frames, scene.truth),
             "photos": list(choices.photos),
+            "generate": list(choices.generate),
+            "generated": choices.generated / len(scene.path),
             **fields(choices),
         }
 
@@ -223,12 +237,14 @@ def run_scene(engine: Engine, scene: LadderScene, listed: list, made: list, fixe
         one = None
         if some is not None:
             photos = tuple(select_context(scene.photos.cameras, len(some.photos)))
-            one = price[shape(some)], engine.choices(scene, photos=photos, **fields(some))
+            where = placed(engine, some)
+            one = engine.choices(scene, photos=photos, generate=where, **fields(some))
+            one = price[shape(some)], one
         entry = {"tolerance": own.tolerance, "predicted": own.predicted_error}
         entry["planning_flops"] = own.planning_cost
         entry["planner"] = measured((budget, own.choices))
         entry["fixed"] = measured(one)
-        entry["random"] = measured(random_plan(scene, listed, budget, rng))
+        entry["random"] = measured(random_plan(engine, scene, listed, budget, rng))
         entry["uniform"] = measured(best_within(uniform, budget))
         plans.append(entry)
     return {

@@ -93,7 +93,7 @@ def summarise(rows: list[dict]) -> dict:
         "worst_violation": float((realised / tolerances[None]).max()),
     }
     truth = points(rows, "planner", "truth")
-    made = np.array([[any(p["planner"]["generate"]) for p in row["plans"]] for row in rows])
+    made = np.array([[p["planner"]["generated"] == 1 for p in row["plans"]] for row in rows])
     for key, some in (("", np.ones_like(made)), ("_by_generated_video", made)):
         equal = [
             full[i] / needed(truth[i][some[i]], full[i], row["full"]["truth"])
@@ -165,7 +165,7 @@ def words(summary: dict) -> str:
         f"{summary['scenes']} scenes. Predicted against realised error: {_rank(summary)}, "
         f"realised / predicted {middle:.2f} [{low:.2f}, {high:.2f}]",
         f"At the full model's error to the truth the median scene takes {saved['median_scene']:.2f} times less compute "
-        f"({made['median_scene']:.2f} times if the video must be generated)",
+        f"({made['median_scene']:.2f} times if every frame must be generated)",
     ]
     return "\n".join([*lines, *(_told(summary, name) for name in CONTROLS)])
 

@@ -13,12 +13,14 @@ from roge_jax import evaluate, model, preview, programs, sampling
 from roge_jax.data import procedural
 from roge_jax.data.raycast import OBJECTS, ROOM, render_views
 from roge_jax.geometry.cameras import Cameras, normalise
-from roge_jax.planning import coverage, proxies
+from roge_jax.planning import coverage, proxies, stretches
 from roge_jax.planning.options import LEAST_LOSS, MERGES, full_choices
 from roge_jax.video import flow, solvers
-from roge_jax.windows import window_views
+from roge_jax.windows import stretch_noise, window_views
 
 CONTEXTS = 6
+# Of 17 frames: where the planner generates nothing alone, and why.
+ELSEWHERE = {"between slots": ((2, 7), (10, 15)), "one frame": ((4, 5), (12, 13))}
 RUNGS = ("plane", "empty", "3 objects", "6 objects", "12 objects", "clutter")
 KEPT = {"plane": (), "empty": (), "3 objects": (2, 6, 9), "6 objects": (2, 3, 6, 7, 9, 10)}
 
@@ -126,8 +128,8 @@ class Engine:
         self.params, self.config = params, config
         self.settings = sampling.Settings().of(config)
         self.programs: dict = {}
-        self.velocity = jax.jit(functools.partial(programs.velocity, config=config, slots="noised"))
-        self.decode = jax.jit(functools.partial(programs.decode, config=config, contexts=0))
+        self.velocity = functools.partial(programs.velocity, slots="noised")
+        self.decode = functools.partial(programs.decode, contexts=0)
         self.encode = jax.jit(functools.partial(model.encode_contexts, config=config))
 
     def program(self, f, config):
@@ -162,25 +164,31 @@ class Engine:
         if choices in scene.kept:
             return scene.kept[choices]
         views, features, shown = self.features(scene, choices)
-        if not choices.generate[0]:
-            frames = np.asarray(model.resized(shown, self.config.height, self.config.width))
-        else:
+        frames = np.array(model.resized(shown, self.config.height, self.config.width))
+        if choices.generate[0] is not None:
+            first, last = choices.generate[0]
+            config = dataclasses.replace(self.config, frames=choices.frames)
             made = self.latents(scene, choices, views, features, shown)
-            frames = np.asarray(self.decode(self.params, *made))
+            frames[first:last] = self.program(self.decode, config)(self.params, *made)
         scene.kept[choices] = frames
         return frames
 
     def latents(self, scene, choices, views, features, shown) -> tuple[jax.Array, jax.Array | None]:
-        """Those of the targets, and what is added to them when they are decoded."""
-        m = len(choices.photos)
+        """Those of the targets that are generated, and what is added to them when they are decoded."""
+        m, (first, last) = len(choices.photos), choices.generate[0]
+        config = dataclasses.replace(self.config, frames=choices.frames)
+        rows = np.array([*range(m), *range(m + first, m + last)])
+        views, features = views | {k: views[k][rows] for k in ("K", "c2w")}, features[rows]
+        shown = shown[first:last]
         if "latents" not in scene.kept:
             scene.kept["latents"] = self.encode(self.params, scene.photos.images)
         known = scene.kept["latents"][np.array(choices.photos)]
-        condition = self.program(model.condition, self.config)
+        condition = self.program(model.condition, config)
         cond = condition(self.params, known, features, views, shown=shown)
-        lost = self.program(preview.lost_detail, self.config)(self.params, shown, cond)
+        lost = self.program(preview.lost_detail, config)(self.params, shown, cond)
         prepared = model.Prepared(known, features, shown, cond, None, lost)
         noise = sampling.window_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
+        noise = stretch_noise(noise, m, first, config)
         settings = dataclasses.replace(
             self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule
         )
@@ -191,9 +199,10 @@ class Engine:
             solver=settings.solver,
             model=self.config.name,
         )
-        run, bar = SimpleNamespace(velocity=self.velocity), SimpleNamespace(update=lambda n: None)
+        run = SimpleNamespace(velocity=self.program(self.velocity, config))
+        bar = SimpleNamespace(update=lambda n: None)
         x0, _ = sampling.integrate(
-            run, self.params, prepared, jnp.asarray(noise), grid, settings, self.config, bar
+            run, self.params, prepared, jnp.asarray(noise), grid, settings, config, bar
         )
         return x0[m:], lost
 
@@ -222,7 +231,7 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
     reference = engine.run(scene, full)
     # Where photos, tokens and size are compared: their effect, not that of steps.
     base = dataclasses.replace(full, steps=max(1, full.steps // 2))
-    head = dataclasses.replace(full, generate=(False,))
+    head = dataclasses.replace(full, generate=(None,))
     small = proxies.half_size(engine.config)
 
     def both(**changes):
@@ -240,6 +249,15 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
         for way in ways(engine)
     ]  # fmt: skip
     row["merge"] = {merge: both(merge=merge) for merge in MERGES[1:]}
+    window = (0, engine.config.frames)
+    row["stretch"] = {
+        length: [_alone(engine, scene, full, place) for place in stretches.places(window, length)]
+        for length in stretches.lengths(engine.config)[:-1]
+    }
+    row["elsewhere"] = {
+        name: [_alone(engine, scene, full, place) for place in places]
+        for name, places in ELSEWHERE.items()
+    }
     row["half"] = both(recon=(small.recon_height, small.recon_width))
     size = (engine.config.height, engine.config.width)
     worth = coverage.coverage(scene.photos.cameras, scene.path, *size)
@@ -253,12 +271,32 @@ def turn_knobs(engine: Engine, scene: LadderScene) -> dict:
         [sorted(kept), 1 - coverage.covered(worth, tuple(kept)) / best, *both(photos=tuple(sorted(kept)))]
         for kept in sets
     ]  # fmt: skip
+    row["frames"] = [
+        _by_frame(engine, scene, dataclasses.replace(full, photos=tuple(sorted(kept))))
+        for kept in [full.photos, sets[0], sets[-1]]
+    ]
     measured = {"detail": proxies.detail(scene.photos.images)}
     measured |= proxies.leave_one_out(engine.params, engine.config, scene.photos, engine.programs)
     measured["richardson"] = proxies.richardson(
         engine.params, engine.config, scene.photos, scene.path, engine.settings, engine.programs
     )
     return row | {"proxies": measured}
+
+
+def _alone(engine: Engine, scene: LadderScene, full, place) -> float:
+    """How far a stretch generated alone is from the same frames of the whole window."""
+    first, last = place
+    alone = dataclasses.replace(full, generate=(place,), frames=last - first)
+    return rms(engine.run(scene, alone)[first:last], engine.run(scene, full)[first:last])
+
+
+def _by_frame(engine: Engine, scene: LadderScene, choices) -> dict:
+    """Of every frame: how much these photos see of it, and how far the RGB head's is from the generated one."""
+    photos = scene.photos.cameras[list(choices.photos)]
+    head = engine.run(scene, dataclasses.replace(choices, generate=(None,)))
+    pairs = zip(engine.run(scene, choices), head, strict=True)
+    seen = coverage.by_frame(photos, scene.path, engine.config.height, engine.config.width)
+    return {"seen": seen.tolist(), "head": [rms(a, b) for a, b in pairs]}
 
 
 # Which proxies may speak for a knob, so that few scenes do not make chance a law.
@@ -268,6 +306,7 @@ SPEAK = {
     "merge": ("redundancy", "leave_one_out", "detail"),
     "half": ("redundancy", "leave_one_out", "detail"),
     "head": ("leave_one_out", "redundancy", "detail"),
+    "stretch": ("richardson", "detail"),
 }
 
 
@@ -291,12 +330,43 @@ def follow(knob: str, errors: np.ndarray, rows: list[dict]) -> list[dict]:
     return [known for _, known in sorted(found, key=lambda pair: -pair[0])]
 
 
+def seen_less(rows: list[dict]) -> tuple[dict, np.ndarray]:
+    """(how the RGB head's error of a frame grows where the photos see less, every scene's error at full coverage).
+
+    In each scene log error = level + log(1 + rise (1 - coverage)), with all photos and with few; the rise that leaves
+    least. The level holds for all photos, which are first in `row["frames"]`.
+    """
+    seen = [np.concatenate([some["seen"] for some in row["frames"]]) for row in rows]
+    errors = [np.log(np.concatenate([some["head"] for some in row["frames"]])) for row in rows]
+
+    def centred(rise: float) -> tuple[np.ndarray, np.ndarray]:
+        growth = [np.log1p(rise * (1.0 - s)) for s in seen]
+        pairs = ([v - v.mean() for v in values] for values in (errors, growth))
+        return tuple(np.concatenate(parts) for parts in pairs)
+
+    def left(rise: float) -> float:
+        error, growth = centred(rise)
+        return float(np.square(error - growth).mean())
+
+    rise = float(min(np.linspace(0.0, 10.0, 201), key=left))
+    own = [1.0 + rise * (1.0 - np.array(row["frames"][0]["seen"])) for row in rows]
+    levels = np.array(
+        [row["head"] / np.sqrt(np.square(f).mean()) for row, f in zip(rows, own, strict=True)]
+    )
+    average = np.sqrt(np.mean([row["head"] ** 2 for row in rows]) / np.square(levels).mean())
+    found = {"rise": rise, "typical": float(1.0 - (average - 1.0) / rise) if rise else 1.0}
+    if rise:
+        found["r"] = float(np.corrcoef(*centred(rise))[0, 1])
+    return found, levels
+
+
 def fit(rows: list[dict], provenance: dict) -> dict:
     """The planner's table from the rows of `turn_knobs`: averages are root mean squares over scenes."""
 
     def mean(values):
         return float(np.sqrt(np.square(np.asarray(values, float)).mean()))
 
+    seen, levels = seen_less(rows)
     steps = np.array([[way[3] for way in row["steps"]] for row in rows])
     ways = [way[:3] for way in rows[0]["steps"]]
     # [scenes, sets, (share lost, error generated, error of the RGB head)]
@@ -309,8 +379,11 @@ def fit(rows: list[dict], provenance: dict) -> dict:
         "photos": np.sqrt(np.square(rate[..., 0]).mean(1)),
         "merge": merge[4][:, 0],
         "half": half[:, 0],
-        "head": np.array([row["head"] for row in rows]),
+        "head": levels,
+        "stretch": np.array([mean([mean(e) for e in row["stretch"].values()]) for row in rows]),
     }
+    window = max(len(row["frames"][0]["seen"]) for row in rows) - 1
+    lengths = sorted(rows[0]["stretch"])
     return {
         "steps": [
             {
@@ -326,6 +399,11 @@ def fit(rows: list[dict], provenance: dict) -> dict:
         "half": mean(half[:, 0]),
         "half_head": mean(half[:, 1]),
         "head": mean([row["head"] for row in rows]),
+        "seen": seen,
+        "stretch": {
+            f"{(length - 1) / window:g}": mean([mean(row["stretch"][length]) for row in rows])
+            for length in lengths
+        },
         "knobs": {name: follow(name, errors, rows) for name, errors in by_scene.items()},
         "provenance": provenance,
     }

@@ -109,12 +109,19 @@ def scene_tokens_read(config: RoGeConfig, m: int) -> int:
 
 
 def preview(config: RoGeConfig, m: int) -> float:
-    """A window that is not generated: photos to scene tokens, the targets' rays, the RGB head, the photo look-up."""
+    """A window that is not generated: photos to scene tokens, and all its frames `shown`."""
+    size = (config.recon_height, config.recon_width)
+    return encoder(config.encoder, *size, m, config.renderer.width) + shown(
+        config, m, config.frames
+    )
+
+
+def shown(config: RoGeConfig, m: int, frames: int) -> float:
+    """Frames that are not generated, from scene tokens at hand: their rays, the RGB head, the photo look-up."""
     size, tokens = (config.recon_height, config.recon_width), scene_tokens_read(config, m)
-    views = config.frames + (m if config.renderer.refinement == "shared" else 0)
+    views = frames + (m if config.renderer.refinement == "shared" else 0)
     rays = renderer(config.renderer, *size, tokens, m, views)
-    rays += lookup(config.renderer, *size, m, config.frames)
-    return encoder(config.encoder, *size, m, config.renderer.width) + rays
+    return rays + lookup(config.renderer, *size, m, frames)
 
 
 # ---- generation ----------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""What runs in a window of a video, compiled for its shapes: preparation, velocity, decoding; or the preview alone."""
+"""What runs in a window of a video, compiled for its shapes: preparation, velocity, decoding; or the preview alone.
+
+A window is generated as a whole, or a stretch of it is, or nothing: other frames are the RGB head's picture.
+"""
 
 import functools
 from collections.abc import Callable
@@ -18,7 +21,7 @@ from .video import flow
 class Programs(NamedTuple):
     """What runs in a window of given shapes, compiled."""
 
-    prepare: Callable  # (params, views) -> Prepared
+    prepare: Callable  # (params, views) -> Prepared; with a `rest`: `prepare_stretch`
     velocity: Callable  # (params, prepared, noise, x, sigma) -> velocity
     decode: Callable  # (params, x0, detail) -> frames [n, h, w, 3]
 
@@ -38,35 +41,52 @@ def velocity(
     return field(x if project is None else project(x, sigma), sigma)
 
 
+def prepare_stretch(
+    params: Tree, views: model.Views, rest: model.Views, *, config: RoGeConfig
+) -> tuple[model.Prepared, jax.Array]:
+    """(`model.prepare` of a stretch of a window, `rgb_head` of the targets of `rest`): the photos, the same in both, are
+    reconstructed once."""
+    tokens = model.reconstruct(params, views, config=config)
+    prepared = model.prepare(params, views, config=config, scene_tokens=tokens)
+    return prepared, rgb_head(params, rest, config=config, scene_tokens=tokens)
+
+
 def decode(params, x0, detail, *, config: RoGeConfig, contexts: int):
     """Latents of a whole window [t, lh, lw, 16] -> frames; contexts are dropped. `detail`: of `model.Prepared`."""
     return model.decode_video(params, x0[contexts:], config=config, detail=detail)
 
 
 def for_window(
-    params: Tree, views: model.Views, config: RoGeConfig, slots: flow.ContextSlots
+    params: Tree,
+    views: model.Views,
+    config: RoGeConfig,
+    slots: flow.ContextSlots,
+    rest: model.Views | None = None,
 ) -> Programs:
     """Compile all pieces for the shapes of `views`, side by side: compiling is what a short run waits for.
 
+    `config.frames` is the number of targets in `views`, all of which are generated; those of `rest` are shown.
     On a mesh (`core.sharding.use`) weights stay where they lie; all else goes in and comes out whole.
     """
     m, whole = views["context_rgb"].shape[0], sharding.everywhere()
     fix, jit = functools.partial, functools.partial(jax.jit, out_shardings=whole)
     pieces = {
-        "prepare": jit(fix(model.prepare, config=config)),
+        "prepare": jit(fix(model.prepare if rest is None else prepare_stretch, config=config)),
         "velocity": jit(fix(velocity, config=config, slots=slots)),
         "decode": jit(fix(decode, config=config, contexts=m)),
     }
 
     shapes = sharding.shapes
-    weights, seen = shapes(params), shapes(views)
-    prepared = shapes(jax.eval_shape(pieces["prepare"], weights, seen))
+    weights = shapes(params)
+    seen = [shapes(some) for some in (views, rest) if some is not None]
+    made = jax.eval_shape(pieces["prepare"], weights, *seen)
+    prepared = shapes(made if rest is None else made[0])
     state = jax.ShapeDtypeStruct(
         (config.slots(m), *config.latent_size, config.vae.latent), jnp.float32, sharding=whole
     )
     sigma = jax.ShapeDtypeStruct((), jnp.float32, sharding=whole)
     arguments = {
-        "prepare": (weights, seen),
+        "prepare": (weights, *seen),
         "velocity": (weights, prepared, state, state, sigma),
         "decode": (weights, state, prepared.detail),
     }
@@ -103,6 +123,3 @@ def for_preview(
     """`for_window`, where the window is not generated."""
     piece = jax.jit(functools.partial(rgb_head, config=config))
     return PreviewProgram(piece.lower(params, views).compile())
-
-
-# ---- sampling ------------------------------------------------------------------------------------

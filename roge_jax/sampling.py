@@ -8,19 +8,22 @@ One window is `config.frames` targets. A path of any other length is padded at i
 as it last moved, and the surplus is dropped. All windows share one world frame and one scale. In a path longer than
 a window, `chain` gives the later windows frames already made as further contexts (the last one, and those closest to
 what comes); `independent` gives every window the photos alone, as the paper does. Windows after the first have equal
-shapes, so there are at most two compilations of anything.
+shapes, so there are at most two compilations of anything. A plan may leave windows, or all of a window but a stretch of
+one length, to the RGB head: for both kinds of window that is one compilation more each.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from . import fields, limits, model, programs
+from .choices import Choices, Planned, around, spans
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
@@ -29,9 +32,20 @@ from .data.scene import prepare as prepare_photos
 from .errors import UserError, did_you_mean
 from .geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
 from .video import flow, solvers
-from .windows import CHAIN_FRAMES, chain_views, chained, view_distance, window_views, windows
+from .windows import (
+    CHAIN_FRAMES,
+    chain_views,
+    chained,
+    stretch_noise,
+    view_distance,
+    window_noise,
+    window_views,
+    windows,
+    woven,
+)
 
-__all__ = ["CHAIN_FRAMES", "chain_views", "chained", "view_distance", "window_views", "windows"]
+__all__ = ["CHAIN_FRAMES", "Choices", "Planned", "chain_views", "chained"]
+__all__ += ["view_distance", "window_noise", "window_views", "windows"]
 
 DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
 LONG = ("chain", "independent")
@@ -77,26 +91,6 @@ class Settings:
         )
 
 
-@dataclasses.dataclass(frozen=True)
-class Choices:
-    """How much of the full model a run uses; `planning.plan` makes them."""
-
-    photos: tuple[int, ...]  # positions among the photos given; the first one is the world frame
-    steps: int
-    solver: str
-    schedule: str
-    recon: tuple[int, int]  # height, width at which the reconstruction sees photos and rays
-    merge: Literal[1, 2, 4]  # `RendererConfig.merge`
-    generate: tuple[bool, ...]  # per window; without it the frames are the RGB head's
-
-
-class Planned(Protocol):
-    """What `sample` reads of a plan: `planning.plan.Plan` is one."""
-
-    @property
-    def choices(self) -> Choices: ...
-
-
 class Photos(NamedTuple):
     """Context photos at generation size and, where it differs, at reconstruction size; cameras in the scene's frame."""
 
@@ -115,9 +109,9 @@ class Result:
     cameras: Cameras
     normalisation: Normalisation
     evaluations: int  # of the velocity network, all windows together
-    windows: tuple[
-        dict[str, Any], ...
-    ]  # {"frames": [first, last], "photos": [...], "generated": [...]}
+    # {"frames": [first, last], "photos": [...], "generated": [...], the frames already made that it saw}, and with a plan
+    # {"rgb_head": [[first, last], ...]}, the frames that are not generated
+    windows: tuple[dict[str, Any], ...]
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
@@ -232,15 +226,6 @@ def noise_levels(settings: Settings, config: RoGeConfig) -> np.ndarray:
     )
 
 
-def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
-    """The noise of a window [t, lh, lw, 16] from seed and number alone, the same on every device.
-
-    NumPy, because compiling JAX's generator takes longer than a short video's sampling.
-    """
-    shape = (config.slots(contexts), *config.latent_size, config.vae.latent)
-    return np.random.default_rng([seed, window]).standard_normal(shape, np.float32)
-
-
 def sample(
     params: Tree,
     config: RoGeConfig,
@@ -278,37 +263,25 @@ def sample(
     warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
     grid = noise_levels(settings, config)
     runs = windows(len(path), config.frames)
-    generate = [True] * len(runs) if plan is None else list(plan.choices.generate)
-    if len(generate) != len(runs):
-        raise UserError(
-            f"The plan is for {len(generate)} windows and this path has {len(runs)}: plan again for this path."
-        )
-    bar = _bar(progress, settings, grid, sum(generate))
+    made, length = spans(plan, runs, config.frames)
+    bar = _bar(progress, settings, grid, sum(first < last for first, last in made))
     frames: list[np.ndarray] = []
     previews: list[np.ndarray] = []
     told: list[dict[str, Any]] = []
     evaluations = 0
-    for number, (start, stop) in enumerate(runs):
+    for number, ((start, stop), (first, last)) in enumerate(zip(runs, made, strict=True)):
         kept: list[int] = list(range(len(context)))
         chosen: list[int] = []
         images, recon, contexts = photos.images, photos.recon, context
         if number and settings.long == "chain":
             kept, chosen = chain_views(context, target[:start], target[start:stop], config)
             found = [frames[i // config.frames][i % config.frames] for i in chosen]
-            made = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
-            images = np.concatenate([images[kept], made])
+            old = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
+            images = np.concatenate([images[kept], old])
             contexts = concatenate(context[kept], target[np.array(chosen, int)])
-            recon = None if recon is None else np.concatenate([recon[kept], _enlarged(made, recon)])
-        views = window_views(images, recon, contexts, target[start:stop], info, config)
-        m, n = len(contexts), stop - start
-        usual = generate[number] and config == unplanned
-        key = m if usual else (m, generate[number], config)
-        if key not in cache:
-            bar.set_description("compiling")
-            with stage("compile"):
-                make = programs.for_window if generate[number] else programs.for_preview
-                cache[key] = make(params, views, config, settings.slots)
-        run = cache[key]
+            recon = None if recon is None else np.concatenate([recon[kept], _enlarged(old, recon)])
+        m, rest = len(contexts), around((start, stop), (first, last))
+        shown = [i for a, b in rest for i in range(a, b)]  # by the RGB head
         told.append(
             {
                 "frames": [start, stop - 1],
@@ -316,28 +289,48 @@ def sample(
                 "generated": chosen,
             }
         )
-        if not generate[number]:
+        if rest:
+            told[-1]["rgb_head"] = [[a, b - 1] for a, b in rest]
+        see = functools.partial(window_views, images, recon, contexts, info=info, config=config)
+        if first == last:
+            part, views = config, [see(target[start:stop])]
+        else:
+            part = dataclasses.replace(config, frames=length)
+            views = [see(target[first:last], frames=length)]
+            if shown:
+                views.append(see(target[np.array(shown)], frames=config.frames - length))
+        usual = first < last and not shown and part == unplanned
+        key = m if usual else (m, first < last, bool(shown), part)
+        if key not in cache:
+            bar.set_description("compiling")
+            with stage("compile"):
+                make = programs.for_window if first < last else programs.for_preview
+                cache[key] = make(params, views[0], part, settings.slots, *views[1:])
+        run = cache[key]
+        if first == last:
             with stage("preview"):
-                preview = np.array(run.preview(params, views))[:n]
-            previews.append(preview)
-            frames.append(_enlarged(preview, photos.images))
-            told[-1]["rgb_head"] = True
+                previews.append(np.array(run.preview(params, *views))[: len(shown)])
+            frames.append(_enlarged(previews[-1], photos.images))
             continue
         bar.set_description("sampling")
         # With fewer photos than given, the targets keep the noise that they have with all of them.
         full = sum(chained(given, config)) if number and settings.long == "chain" else given
         with stage("prepare"):
-            prepared = jax.block_until_ready(run.prepare(params, views))
-            noise = jax.device_put(
-                window_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :],
-                sharding.everywhere(),
-            )
+            ready = jax.block_until_ready(run.prepare(params, *views))
+            prepared, picture = ready if shown else (ready, None)
+            noise = window_noise(settings.seed, number, max(full, m), config)[-config.slots(m) :]
+            noise = stretch_noise(noise, m, first - start, part)
+            noise = jax.device_put(noise, sharding.everywhere())
         with stage("sample"):
-            x0, count = integrate(run, params, prepared, noise, grid, settings, config, bar)
+            x0, count = integrate(run, params, prepared, noise, grid, settings, part, bar)
         with stage("decode"):
             # Copies: on a CPU a view would keep the device's array alive.
-            frames.append(np.array(run.decode(params, x0, prepared.detail))[:n])
-            previews.append(np.array(prepared.shown)[:n])
+            frames.append(np.array(run.decode(params, x0, prepared.detail))[: last - first])
+            previews.append(np.array(prepared.shown)[: last - first])
+            if picture is not None:
+                others = np.array(picture)[: len(shown)]
+                previews[-1] = woven(previews[-1], others, first - start)
+                frames[-1] = woven(frames[-1], _enlarged(others, photos.images), first - start)
         evaluations += count
     bar.close()
     return Result(

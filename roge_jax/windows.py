@@ -1,11 +1,15 @@
-"""How a long path is cut into windows of the model, and which views each of them sees."""
+"""How a long path is cut into windows of the model, which views each of them sees, and which of its frames are generated.
+
+A window may be generated in part: a stretch of 1 + 4k frames, as a shorter window of its own, since the VAE is causal in
+time and starts afresh at any frame. The other frames are the RGB head's picture.
+"""
 
 import numpy as np
 
 from . import model
 from .config import RoGeConfig
 from .geometry.cameras import Cameras, Normalisation, camera_vector, concatenate, to_host
-from .geometry.packing import pad_path
+from .geometry.packing import GROUP, pad_path
 
 CHAIN_FRAMES = 2  # frames already made that join as contexts, where the model takes that many
 
@@ -60,9 +64,12 @@ def window_views(
     targets: Cameras,
     info: Normalisation,
     config: RoGeConfig,
+    *,
+    frames: int | None = None,
 ) -> model.Views:
-    """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window."""
-    targets = pad_path(targets, config.frames)
+    """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window, or to
+    `frames`."""
+    targets = pad_path(targets, config.frames if frames is None else frames)
     cameras = concatenate(contexts, targets)
     vectors = camera_vector(
         contexts, config.height, config.width, info.camera_scale, info.points_flag
@@ -74,3 +81,24 @@ def window_views(
         "vectors": np.asarray(vectors, np.float32),
     }
     return views if recon is None else views | {"context_recon": recon.astype(np.float32)}
+
+
+def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:
+    """The noise of a window [t, lh, lw, 16] from seed and number alone, the same on every device.
+
+    NumPy, because compiling JAX's generator takes longer than a short video's sampling.
+    """
+    shape = (config.slots(contexts), *config.latent_size, config.vae.latent)
+    return np.random.default_rng([seed, window]).standard_normal(shape, np.float32)
+
+
+def stretch_noise(noise: np.ndarray, contexts: int, offset: int, config: RoGeConfig) -> np.ndarray:
+    """What a stretch of `config.frames`, `offset` frames into a window, has of the window's noise [t, lh, lw, 16]: that
+    of the contexts and of the slots that its frames have there (`offset` is a multiple of four)."""
+    first = contexts + offset // GROUP
+    return np.concatenate([noise[:contexts], noise[first : first + config.slots(0)]])
+
+
+def woven(made: np.ndarray, rest: np.ndarray, at: int) -> np.ndarray:
+    """Frames of a window in their order: those `made` come after the first `at` of the `rest`."""
+    return np.concatenate([rest[:at], made, rest[at:]])

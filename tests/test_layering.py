@@ -33,12 +33,13 @@ ALLOWED = {
     "checkpoint": _PARTS | {"model", "weights", "folders"},
     "cost": _PARTS | {"model"},
     "limits": _BASE,
+    "choices": _BASE,
     "training": _PARTS
     | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost", "folders"},
     "windows": _PARTS | {"model"},
     "programs": _PARTS | {"model"},
-    "sampling": _PARTS | {"model", "data", "programs", "windows", "limits"},
-    "planning": _PARTS | {"model", "data", "cost", "windows", "programs", "sampling"},
+    "sampling": _PARTS | {"model", "data", "programs", "windows", "choices", "limits"},
+    "planning": _PARTS | {"model", "data", "cost", "windows", "programs", "choices", "sampling"},
 }
 # Programs and their helpers may import anything but other programs.
 PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check"}

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import json
 import sys
+import types
 from pathlib import Path
 
 import jax
@@ -14,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
 import plan_ladder
 import plan_report
-from plan_runs import CONTEXTS, Engine, LadderScene, make, rms
+from plan_runs import CONTEXTS, Engine, LadderScene, make, rms, seen_less
 
 from roge_jax import checkpoint, model, sampling
 from roge_jax.config import preset
@@ -34,7 +35,7 @@ def ladder(planner, *, predicted=None, tolerance=TOLERANCE, **controls):
         if found is None:
             return None
         gflop, error = found
-        return {"flops": gflop * 1e9, "full": error, "truth": 0.05 + error, "generate": [False]}
+        return {"flops": gflop * 1e9, "full": error, "truth": 0.05 + error, "generated": 0.0}
 
     rows = []
     for i, own in enumerate(planner):
@@ -209,8 +210,8 @@ def test_uniform_plans_use_any_number_of_photos_and_never_exceed_the_budget(engi
     assert none[0] and not none[-1] and none == sorted(none, reverse=True)
     plans = [(plan, budget) for plan, budget in zip(found, budgets, strict=True) if plan]
     assert all(flops <= budget for (flops, _), budget in plans)
-    generated = [choices for (_, choices), _ in plans if choices.generate[0]]
-    shown = [choices for (_, choices), _ in plans if not choices.generate[0]]
+    generated = [choices for (_, choices), _ in plans if choices.generated]
+    shown = [choices for (_, choices), _ in plans if not choices.generated]
     assert {len(c.photos) for c in generated} == set(range(1, CONTEXTS + 1))
     assert {len(c.photos) for c in shown} == set(range(1, CONTEXTS + 1))
     assert all(len(set(c.photos)) == len(c.photos) for c in generated + shown)
@@ -221,7 +222,7 @@ def test_a_fixed_plan_is_the_best_predicted_within_its_budget(engine, scene):
     def option(photos, error, flops, **changes):
         return Option(engine.choices(scene, photos=photos, **changes), error, flops)
 
-    head = {"generate": (False,)}
+    head = {"generate": (None,)}
     listed = [
         [option((0, 1), 0.01, 50.0), option((0,), 0.03, 30.0), option((0, 1), 0.04, 20.0, **head)],
         [option((2, 5), 0.05, 50.0), option((3,), 0.05, 30.0), option((1, 4), 0.03, 20.0, **head)],
@@ -231,18 +232,50 @@ def test_a_fixed_plan_is_the_best_predicted_within_its_budget(engine, scene):
     kinds = {50.0: (2, True), 49.9: (2, False), 20.0: (2, False), 19.9: None}
     for budget, expected in kinds.items():
         found = plan_ladder.fixed_plan(listed, budget)
-        assert (found and (len(found.photos), found.generate[0])) == expected
+        assert (found and (len(found.photos), found.generated > 0)) == expected
 
 
 def test_random_plans_are_drawn_from_just_below_the_budget(engine, scene):
     costs = (10.0, 84.0, 86.0, 95.0, 100.0, 101.0)
     listed = [Option(engine.choices(scene, photos=(i,)), 0.0, c) for i, c in enumerate(costs)]
     rng = np.random.default_rng(0)
-    drawn = [plan_ladder.random_plan(scene, listed, 100.0, rng) for _ in range(60)]
+    drawn = [plan_ladder.random_plan(engine, scene, listed, 100.0, rng) for _ in range(60)]
     assert {flops for flops, _ in drawn} == {86.0, 95.0, 100.0}
     assert len({choices.photos for _, choices in drawn}) == CONTEXTS
-    assert plan_ladder.random_plan(scene, listed, 60.0, rng)[0] == 10.0
-    assert plan_ladder.random_plan(scene, listed, 9.0, rng) is None
+    assert plan_ladder.random_plan(engine, scene, listed, 60.0, rng)[0] == 10.0
+    assert plan_ladder.random_plan(engine, scene, listed, 9.0, rng) is None
+
+
+def test_generated_frames_of_controls_stand_in_the_middle_or_anywhere(engine, scene):
+    wide = types.SimpleNamespace(config=dataclasses.replace(engine.config, frames=17))
+    choices = engine.choices(scene, generate=((12, 17),), frames=5)
+    rng = np.random.default_rng(0)
+    assert plan_ladder.placed(wide, choices) == ((8, 13),)
+    drawn = {plan_ladder.placed(wide, choices, rng) for _ in range(40)}
+    assert drawn == {((first, first + 5),) for first in (0, 4, 8, 12)}
+    assert plan_ladder.placed(wide, engine.choices(scene, generate=(None,)), rng) == (None,)
+
+
+def test_the_rise_of_the_heads_error_is_found_again():
+    rng = np.random.default_rng(0)
+    levels = (0.01, 0.02)
+    rows = []
+    for level in levels:
+        frames = []
+        for low in (0.7, 0.1):  # all photos, few of them
+            seen = rng.uniform(low, 1.0, 17)
+            frames.append({"seen": seen, "head": level * (1 + 2.5 * (1 - seen))})
+        head = np.sqrt(np.square(frames[0]["head"]).mean())
+        rows.append({"frames": frames, "head": head})
+    found, own = seen_less(rows)
+    assert found["rise"] == pytest.approx(2.5) and found["r"] == pytest.approx(1.0)
+    np.testing.assert_allclose(own, levels)
+    # A frame of typical coverage has the average of the levels times that of the growth.
+    average = np.sqrt(np.mean([row["head"] ** 2 for row in rows]))
+    typical = np.sqrt(np.square(levels).mean()) * (1 + 2.5 * (1 - found["typical"]))
+    assert typical == pytest.approx(average)
+    flat = [{"frames": [{"seen": f["seen"], "head": np.full(17, 0.01)} for f in row["frames"]], "head": 0.01} for row in rows]  # fmt: skip
+    assert seen_less(flat)[0] == {"rise": 0.0, "typical": 1.0}
 
 
 def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
@@ -251,7 +284,8 @@ def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
     """Runs are faked: each photo, step and picture left out adds an error."""
 
     def run(scene, choices):
-        lost = CONTEXTS - len(choices.photos) + choices.merge + 10 * (not choices.generate[0])
+        lost = CONTEXTS - len(choices.photos) + choices.merge
+        lost += 10 * (1 - choices.generated / len(scene.path))
         return scene.truth + np.float32(1e-3 * (lost + 20 * (choices.recon != whole.recon)))
 
     whole = engine.choices(scene)

@@ -34,6 +34,7 @@ TABLE = table.parse(
         **{"photos": 0.12, "photos_head": 0.13},
         **{"merge": {2: 0.01, 4: 0.02}, "merge_head": {2: 0.01, 4: 0.02}},
         **{"half": 0.03, "half_head": 0.04, "head": 0.08},
+        **{"seen": {"rise": 2.0, "typical": 0.5}, "stretch": {0.25: 0.04, 0.75: 0.02}},
         "knobs": {
             "photos": [{"proxy": "leave_one_out", "typical": 0.1, "power": 1.0}],
             "steps": [
@@ -42,6 +43,7 @@ TABLE = table.parse(
             ],
             "merge": [{"proxy": "redundancy", "typical": 0.3, "power": 1.0}],
             "half": [],
+            "stretch": [],
             "head": [{"proxy": "detail", "typical": 0.05, "power": 0.5}],
         },
         "provenance": {},
@@ -298,7 +300,7 @@ def test_the_window_that_is_seen_best_is_the_one_not_generated(photos):
         path = Cameras(photos.cameras.K[order * 2], np.concatenate([p[order] for p in parts]))
         worth = coverage.coverage(photos.cameras, path, CONFIG.height, CONFIG.width)
         listed = list_options(photos, CONFIG, path, SETTINGS, TABLE, {}, worth)
-        mixed = [o.choices.generate for o in listed if sum(o.choices.generate) == 1]
+        mixed = [o.choices.generate for o in listed if o.choices.generate.count(None) == 1]
         assert mixed and all(generate[turned] for generate in mixed)
 
 
@@ -327,14 +329,14 @@ def test_every_knob_changes_the_run_as_it_says(weights, photos, path):
     assert result.evaluations == 2 and len(result.frames) == 5
     assert result.preview.shape[1:3] == half and result.windows[0]["photos"] == [1, 3]
     assert np.isfinite(result.frames).all()
-    ((count, generated, config),) = cache
-    assert (count, generated, config.renderer.merge) == (2, True, 4)
+    ((count, generated, shown, config),) = cache
+    assert (count, generated, shown, config.renderer.merge) == (2, True, False, 4)
 
 
 def test_windows_that_are_not_generated_show_the_rgb_head(weights, photos, path):
     full = full_choices(photos, CONFIG, path, SETTINGS)
     half = (CONFIG.recon_height // 2, CONFIG.recon_width // 2)
-    choices = dataclasses.replace(full, photos=(2,), recon=half, generate=(False, False))
+    choices = dataclasses.replace(full, photos=(2,), recon=half, generate=(None, None))
     result = run(weights, photos, path, choices, {}, long="independent")
     assert result.evaluations == 0 and all(window["rgb_head"] for window in result.windows)
     shown = model.resized(jax.numpy.asarray(result.preview), CONFIG.height, CONFIG.width)

@@ -24,16 +24,19 @@ FALL = np.radians(
 NOTHING = 1e-9  # a photo that adds less is not worth its place
 
 
-def coverage(photos: Cameras, path: Cameras, height: int, width: int) -> np.ndarray:
+def coverage(
+    photos: Cameras, path: Cameras, height: int, width: int, *, frames: int = FRAMES
+) -> np.ndarray:
     """How well each photo sees each point that the path looks at: [m, points] from 0 (not at all) to 1.
 
+    Points of up to `frames` views of the path, evenly spread, one after another.
     Cameras in one frame, any unit; K in pixels of height x width images. Inside its picture a photo is worth
     exp(-angle / FALL), the angle being between its ray and the target's, times min(1, (its distance is
     to the target's as 1 to x)), because what is far away is seen coarsely.
     """
     photos, path = to_host(photos), to_host(path)
-    frames = np.unique(np.linspace(0, len(path) - 1, min(FRAMES, len(path))).round().astype(int))
-    path = path[frames]
+    looked = np.linspace(0, len(path) - 1, min(frames, len(path))).round().astype(int)
+    path = path[looked]
     shrink = np.array([GRID[1] / width, GRID[0] / height, 1.0])[None, :, None]
     rays = plucker_float64(path.K * shrink, path.c2w, *GRID)[..., :3].reshape(len(path), -1, 3)
     focus = focus_distance(photos) if len(photos) > 1 else _reach(photos, path)
@@ -52,6 +55,12 @@ def coverage(photos: Cameras, path: Cameras, height: int, width: int) -> np.ndar
             np.where(inside, np.exp(-angle / FALL) * np.minimum(1.0, distance / away), 0.0)
         )
     return np.stack(worth)
+
+
+def by_frame(photos: Cameras, path: Cameras, height: int, width: int) -> np.ndarray:
+    """Coverage of every frame of the path by all photos together, 0 to 1: [n]."""
+    worth = coverage(photos, path, height, width, frames=len(path))
+    return worth.max(0).reshape(len(path), -1).mean(1)
 
 
 def _directions(points: np.ndarray, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

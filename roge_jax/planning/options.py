@@ -6,18 +6,20 @@ Errors of different knobs are taken as independent: their squares add. `table` h
 
 import dataclasses
 import itertools
+from collections import Counter
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from .. import cost
+from ..choices import Choices, around
 from ..config import RoGeConfig
 from ..errors import UserError
 from ..geometry.cameras import Cameras
-from ..sampling import Choices, Photos, Settings
+from ..sampling import Photos, Settings
 from ..video import flow, solvers
 from ..windows import chained, windows
-from . import coverage, proxies
+from . import coverage, proxies, stretches
 from .table import Table
 from .table import scale as factor
 
@@ -43,7 +45,8 @@ def full_choices(photos: Photos, config: RoGeConfig, path: Cameras, settings: Se
         schedule=settings.schedule,
         recon=(config.recon_height, config.recon_width),
         merge=config.renderer.merge,
-        generate=(True,) * len(windows(len(path), config.frames)),
+        generate=tuple(windows(len(path), config.frames)),
+        frames=config.frames,
     )
 
 
@@ -59,10 +62,8 @@ def list_options(
     """All combinations of the knobs with predicted errors and FLOPs; the full model alone if `worth` is None."""
     settings = settings.of(config)
     full = full_choices(photos, config, path, settings)
-    parts = windows(len(path), config.frames)
-    spans = np.array([stop - start for start, stop in parts]) / len(path)
     evaluations = _evaluations(settings)
-    price = Prices(photos, config, settings, len(spans))
+    price = Prices(config, settings, len(path))
     options = [Option(full, 0.0, price(full, evaluations))]
     if worth is None:
         return options
@@ -82,9 +83,10 @@ def list_options(
     merges = [(m, table.merge.get(m, 0.0), table.merge_head.get(m, 0.0)) for m in MERGES]
     if full.merge != 1:
         merges = [(full.merge, 0.0, 0.0)]
-    # Where little is seen there is most to make up: those windows are generated first.
-    first = np.argsort([seen(photos, path[a:b], config) for a, b in parts], kind="stable")
-    rank = np.argsort(first)
+    seen = coverage.by_frame(photos.cameras, path, config.height, config.width)
+    cuts = [
+        (cut, *_shares(cut, np.square(table.of_head(seen)))) for cut in stretches.cuts(seen, config)
+    ]
     for (kept, lost), (merge, *e_merge), (size, *e_size) in itertools.product(
         _photo_sets(worth), merges, sizes
     ):
@@ -98,32 +100,26 @@ def list_options(
             )
             for k in (0, 1)
         )
-        head = float(np.hypot(head, scale["head"] * table.head))
         for solver, schedule, count, cost_steps, e_steps in steps:
             made = float(np.hypot(loss, scale["steps"] * e_steps))
-            for generated in range(len(spans) + 1):
-                if generated == 0 and count != full.steps:
+            for cut, share, left in cuts:
+                if share == 0 and count != full.steps:
                     continue  # no steps are taken: one entry is enough
-                squares = np.where(rank < generated, made**2, head**2)
-                choices = Choices(
-                    kept,
-                    count,
-                    solver,
-                    schedule,
-                    size,
-                    merge,
-                    tuple(bool(r < generated) for r in rank),
-                )
-                error = float(np.sqrt((squares * spans).sum()))
+                apart = scale["stretch"] * table.of_stretch(cut.frames, config.frames)
+                squares = share * (made**2 + apart**2) + (1 - share) * head**2
+                error = float(np.sqrt(squares + scale["head"] ** 2 * left))
+                choices = Choices(kept, count, solver, schedule, size, merge, *cut)
                 if choices != full:
                     options.append(Option(choices, error, price(choices, cost_steps)))
     return options
 
 
-def seen(photos: Photos, path: Cameras, config: RoGeConfig) -> float:
-    """Coverage of a part of the path by all photos."""
-    worth = coverage.coverage(photos.cameras, path, config.height, config.width)
-    return coverage.covered(worth, tuple(range(len(worth))))
+def _shares(cut: stretches.Cut, heads: np.ndarray) -> tuple[float, float]:
+    """(share of the frames that are generated; sum of the others' `heads` [n], divided by n)."""
+    made = np.zeros(len(heads), bool)
+    for span in cut.generate:
+        made[slice(*(span or (0, 0)))] = True
+    return float(made.mean()), float(heads[~made].sum() / len(heads))
 
 
 def _photo_sets(worth: np.ndarray) -> list[tuple[tuple[int, ...], float | None]]:
@@ -145,20 +141,38 @@ def _evaluations(settings: Settings) -> int:
 
 
 class Prices:
-    """FLOPs of a run under choices."""
+    """FLOPs of a run under choices, along a path of so many `frames`: what runs in each window, added up."""
 
-    def __init__(self, photos: Photos, config: RoGeConfig, settings: Settings, windows: int):
-        self.config, self.settings, self.windows = config, settings, windows
-        self.photos = photos
-        self.known: dict[Any, tuple[float, float, float]] = {}
+    def __init__(self, config: RoGeConfig, settings: Settings, frames: int):
+        self.config, self.settings = config, settings
+        self.windows = windows(frames, config.frames)
+        self.known: dict[Any, tuple[float, float]] = {}
+        self.kinds: dict[Any, Counter] = {}
 
-    def window(self, config: RoGeConfig, m: int) -> tuple[float, float, float]:
-        """FLOPs of a window of m contexts: generated without evaluations, one evaluation, RGB head alone."""
-        key = (config.recon_height, config.renderer.merge, m)
+    def window(self, config: RoGeConfig, m: int, made: int, rest: bool) -> tuple[float, float]:
+        """FLOPs of a window of m contexts without evaluations, and of one evaluation: `made` frames are generated
+        together, and others shown beside them if there is a `rest`."""
+        key = (config.recon_height, config.renderer.merge, m, made, rest)
         if key not in self.known:
-            parts = cost.estimate(config, m, 0)
-            self.known[key] = parts.total_flops, parts.flops["velocity"], cost.preview(config, m)
+            if not made:
+                self.known[key] = cost.preview(config, m), 0.0
+            else:
+                parts = cost.estimate(dataclasses.replace(config, frames=made), m, 0)
+                beside = cost.shown(config, m, config.frames - made) if rest else 0.0
+                self.known[key] = parts.total_flops + beside, parts.flops["velocity"]
         return self.known[key]
+
+    def count(self, choices: Choices) -> Counter:
+        """How many windows of each kind (a later one, frames generated together, whether others are shown) there are."""
+        key = (choices.generate, choices.frames)
+        if key not in self.kinds:
+            self.kinds[key] = Counter(
+                (bool(number), choices.frames if span else 0, bool(around(window, span or window)))
+                for number, (window, span) in enumerate(
+                    zip(self.windows, choices.generate, strict=True)
+                )
+            )
+        return self.kinds[key]
 
     def __call__(self, choices: Choices, evaluations: int) -> float:
         renderer = dataclasses.replace(self.config.renderer, merge=choices.merge)
@@ -166,11 +180,12 @@ class Prices:
         config = dataclasses.replace(
             self.config, recon_height=height, recon_width=width, renderer=renderer
         )
-        m, total = len(choices.photos), 0.0
-        for number, generated in enumerate(choices.generate):
-            later = number and self.settings.long == "chain"
-            fixed, once, head = self.window(config, sum(chained(m, config)) if later else m)
-            total += fixed + evaluations * once if generated else head
+        total, m = 0.0, len(choices.photos)
+        for (later, made, rest), times in self.count(choices).items():
+            chain = later and self.settings.long == "chain"
+            contexts = sum(chained(m, config)) if chain else m
+            fixed, once = self.window(config, contexts, made, rest)
+            total += times * (fixed + evaluations * once)
         return total
 
 

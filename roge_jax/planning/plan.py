@@ -1,4 +1,4 @@
-"""One tolerance in, one `Plan` out: which photos, tokens, steps, resolution and windows a run pays for.
+"""One tolerance in, one `Plan` out: which photos, tokens, steps, resolution and frames a run pays for.
 
     plan = rj.plan(params, config, photos, path, tolerance=0.02)
     print(plan.explain())
@@ -17,18 +17,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import cost
+from ..choices import Choices
 from ..config import RoGeConfig
 from ..core.params import Tree
 from ..data.scene import Scene, select_context
 from ..errors import UserError
 from ..geometry.cameras import Cameras
-from ..sampling import Choices, Photos, Settings, read_photos
+from ..sampling import Photos, Settings, read_photos
 from . import coverage, proxies
 from .options import Option, choose, full_choices, list_options, next_best, trail
 from .table import Table, load
 
 TOLERANCE = 0.02
 PROBE = 0.01
+NAMED = 4  # stretches that `explain` names
 
 
 class Purchase(NamedTuple):
@@ -49,6 +51,7 @@ class Plan:
     """
 
     choices: Choices
+    frames: int  # of the path
     tolerance: float
     max_cost: float | None
     predicted_error: float
@@ -67,7 +70,7 @@ class Plan:
             f"plan for tolerance {self.tolerance:g}: predicted error {self.predicted_error:.4f} (RMS colour against the "
             f"full model), {cost.scaled(self.predicted_cost, 'FLOP')} of {cost.scaled(self.full_cost, 'FLOP')} "
             f"({100 * part:.0f} %), {cost.scaled(self.planning_cost, 'FLOP')} for planning",
-            f"  {_named(self.choices)}",
+            f"  {_named(self.choices)}; {_generated(self.choices, self.frames)}",
         ]
         lines += [f"  {'bought' if i else 'start '}  {_line(p)}" for i, p in enumerate(self.bought)]
         if self.refused is not None:
@@ -147,6 +150,7 @@ def plan(
         )
     return Plan(
         choices=chosen.choices,
+        frames=len(path),
         tolerance=float(tolerance),
         max_cost=None if max_cost is None else float(max_cost),
         predicted_error=chosen.error,
@@ -177,14 +181,21 @@ def photos_of(scene: Scene, config: RoGeConfig, context: Sequence[int] | None) -
 
 
 def _named(c: Choices) -> str:
-    made = sum(c.generate)
     tokens = {1: "all scene tokens", 2: "half the scene tokens", 4: "a quarter of the scene tokens"}
-    steps = f"{c.steps} steps of {c.solver} ({c.schedule})" if made else "nothing generated"
-    some = f"; {made} of {len(c.generate)} windows generated" if 0 < made < len(c.generate) else ""
+    steps = f"{c.steps} steps of {c.solver} ({c.schedule})" if c.generated else "no steps"
     return (
         f"{len(c.photos)} photos {list(c.photos)}, {tokens[c.merge]}, reconstruction at "
-        f"{c.recon[0]}x{c.recon[1]}, {steps}{some}"
+        f"{c.recon[0]}x{c.recon[1]}, {steps}"
     )
+
+
+def _generated(c: Choices, frames: int) -> str:
+    """Which of so many frames are generated."""
+    if c.generated in (0, frames):
+        return f"{'no' if c.generated == 0 else 'every'} frame of {frames} is generated"
+    spans = [f"{a} to {b - 1}" for a, b in filter(None, c.generate)]
+    more = f" and {len(spans) - NAMED} more stretches" if len(spans) > NAMED else ""
+    return f"{c.generated} of {frames} frames are generated ({', '.join(spans[:NAMED])}{more})"
 
 
 def _purchase(before: Option | None, after: Option) -> Purchase:
@@ -200,10 +211,10 @@ def _purchase(before: Option | None, after: Option) -> Purchase:
         changes.append(f"reconstruction {a.recon[0]}x{a.recon[1]} -> {b.recon[0]}x{b.recon[1]}")
     if a.merge != b.merge:
         changes.append(f"scene tokens 1/{a.merge} -> 1/{b.merge}")
-    if sum(a.generate) != sum(b.generate):
-        changes.append(f"windows generated {sum(a.generate)} -> {sum(b.generate)}")
-    if any(b.generate) and (a.steps, a.solver, a.schedule) != (b.steps, b.solver, b.schedule):
-        old = f"{a.steps} {a.solver} ({a.schedule}) -> " if any(a.generate) else ""
+    if a.generate != b.generate:
+        changes.append(f"frames generated {a.generated} -> {b.generated}")
+    if b.generated and (a.steps, a.solver, a.schedule) != (b.steps, b.solver, b.schedule):
+        old = f"{a.steps} {a.solver} ({a.schedule}) -> " if a.generated else ""
         changes.append(f"steps {old}{b.steps} {b.solver} ({b.schedule})")
     gain, extra = before.error - after.error, after.flops - before.flops
     return Purchase(

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..errors import UserError
 
 FILE = Path(__file__).parent.parent / "assets" / "planning.json"
@@ -46,11 +48,22 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Seen:
+    """How the RGB head's error of a frame grows as the photos see less of it: as 1 + rise * (1 - coverage)."""
+
+    rise: float
+    typical: float  # coverage of a frame whose error is the average
+    r: float = 1.0  # correlation of the logarithms over the frames measured, within scenes
+
+
+@dataclass(frozen=True)
 class Table:
     """RMS errors of single knobs, in colours from 0 to 1, averages (root mean square) over scenes.
 
     `photos`: error per square root of the share of coverage lost (a pixel is seen well or not: squares add). `merge`,
-    `half`: fewer scene tokens, reconstruction at half size. `head`: frames of the RGB head in place of generated ones.
+    `half`: fewer scene tokens, reconstruction at half size. `head`: frames of the RGB head in place of generated ones,
+    where the photos see as much as there (`seen`). `stretch`: a stretch generated alone in place of the same
+    frames of a whole window, by its share of the window's slots after the first.
     The `_head` values hold for frames of the RGB head.
     """
 
@@ -63,8 +76,22 @@ class Table:
     half: float
     half_head: float
     head: float
+    seen: Seen
+    stretch: dict[float, float]
     knobs: dict[str, tuple[Knob, ...]]
     provenance: dict[str, Any]
+
+    def of_head(self, seen: np.ndarray) -> np.ndarray:
+        """Errors of frames of the RGB head that the photos cover as `seen` says, 0 to 1, of any shape."""
+        rise, typical = self.seen.rise, self.seen.typical
+        return self.head * (1.0 + rise * (1.0 - seen)) / (1.0 + rise * (1.0 - typical))
+
+    def of_stretch(self, frames: int, window: int) -> float:
+        """Error of `frames` generated alone that belong to a window of so many; none for all of it."""
+        if frames == window:
+            return 0.0
+        shares, errors = zip(*sorted(self.stretch.items()), strict=True)
+        return float(np.interp((frames - 1) / (window - 1), shares, errors))
 
 
 def parse(name: str, values: dict[str, Any]) -> Table:
@@ -74,6 +101,8 @@ def parse(name: str, values: dict[str, Any]) -> Table:
     plain["knobs"] = {
         knob: tuple(Knob(**row) for row in rows) for knob, rows in values["knobs"].items()
     }
+    plain["seen"] = Seen(**values["seen"])
+    plain["stretch"] = {float(k): float(v) for k, v in values["stretch"].items()}
     for field in ("merge", "merge_head"):
         plain[field] = {int(k): float(v) for k, v in values[field].items()}
     return Table(name=name, **plain)
