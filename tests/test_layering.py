@@ -33,6 +33,7 @@ ALLOWED = {
     "checkpoint": _PARTS | {"model", "weights", "folders"},
     "cost": _PARTS | {"model"},
     "limits": _BASE,
+    "scene_limits": _BASE | {"data", "limits"},
     "training": _PARTS
     | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost", "folders"},
     "windows": _PARTS | {"model"},
