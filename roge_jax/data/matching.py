@@ -198,19 +198,23 @@ def photo_misfits(distances: dict[Pair, float], views: Sequence[int]) -> np.ndar
     return np.array([min(d) if d else np.nan for d in own])
 
 
-def focal_error(matches: Matches, cameras: Cameras) -> float:
-    """By how much at least the focal lengths are wrong: the factor nearest to 1 that fits as well as the best, minus 1.
+def focal_error(matches: Matches, cameras: Cameras) -> tuple[float, float]:
+    """(by how much at least the focal lengths are wrong, how much better others fit).
 
-    All focal lengths are multiplied by FACTORS; a factor fits as well as the best if the mean over pairs of the median
-    distance is within SLACK of the smallest. 0.0 where the given ones do, as for cameras that move without turning:
-    there a wrong focal length is another depth and contradicts nothing.
+    All focal lengths are multiplied by FACTORS; what is compared is the mean over pairs of the median distance. The first
+    number is the factor nearest to 1 within SLACK of the best, minus 1; the second what is given over the best. Errors of
+    poses make some other focal length fit a little better, too: the first means something only where the second is large.
+    (0, about 1) for cameras that move without turning: there a wrong focal length is another depth, no contradiction.
     """
-    cost = []
-    for factor in FACTORS:
-        distances = misfits(matches, scale_focal(cameras, factor))
-        cost.append(np.mean(list(distances.values())))
-    fits = np.array(cost) <= SLACK * np.min(cost)
-    return float(min(FACTORS[fits], key=lambda factor: abs(np.log(factor))) - 1.0)
+    cost = np.array(
+        [
+            np.mean(list(misfits(matches, scale_focal(cameras, factor)).values()))
+            for factor in FACTORS
+        ]
+    )
+    given = cost[np.argmin(np.abs(FACTORS - 1.0))]
+    near = min(FACTORS[cost <= SLACK * cost.min()], key=lambda factor: abs(np.log(factor)))
+    return float(near - 1.0), float(given / max(cost.min(), 1e-12))
 
 
 def pose_agreement(
