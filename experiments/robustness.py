@@ -15,7 +15,8 @@ scenes' own difficulty cancels. A method *breaks* where its mean PSNR has lost 1
 levels, with a bootstrap interval; a second break is where it falls below `nearest` under the same disturbance.
 With --limits the earlier 1 dB break of the two outputs, in units of what can be seen at run time (`roge_jax.limits`),
 becomes the limit of the warning; where a limit is an estimate from the photos and more than 5 % of 200 undisturbed
-scenes lie beyond it, it moves outwards to their 95 % quantile. The published system reports no such curves. Our numbers: docs/robustness.md.
+scenes lie beyond it, it moves outwards to their 95 % quantile. What wrong poses and focal lengths show in matched photos
+is measured without the network (`robustness_matching`). `--only` measures some of it again and keeps the rest. The published system reports no such curves. Our numbers: docs/robustness.md.
 """
 
 import argparse
@@ -37,11 +38,11 @@ from robustness_report import (
     LOSS,
     METHODS,
     METRICS,
-    REACHES,
     RESAMPLES,
     SHOWN,
     SHRUNK,
     breaks,
+    by_reach,
     draw,
     jpeg_row,
     limit_rows,
@@ -325,26 +326,6 @@ def measure(
     if "extrapolation" in knobs:
         found["extrapolation"] = by_reach(results["extrapolation", 0.0])
     return found
-
-
-def by_reach(results: list) -> dict[str, Any]:
-    """Per-frame scores of the path that leaves the photos, read off at fixed distances from their hull."""
-    levels = [0.0, *REACHES]
-    scores = {
-        m: {k: np.full((len(levels), len(results)), np.nan) for k in METRICS} for m in METHODS
-    }
-    for scene, (_, frames, reach) in enumerate(results):
-        inside = reach < 0.1
-        order = np.argsort(np.where(inside, -1.0, reach))
-        for method in METHODS:
-            for metric in METRICS:
-                y = frames[method][metric]
-                scores[method][metric][0, scene] = y[inside].mean()
-                read = np.interp(REACHES, reach[order], y[order], right=np.nan)
-                scores[method][metric][1:, scene] = read
-    listed = {m: {k: v.tolist() for k, v in row.items()} for m, row in scores.items()}
-    reached = [[x] * len(results) for x in levels]
-    return {"levels": levels, "scores": listed, "seen": {"extrapolation": reached}}
 
 
 # ---- the program ---------------------------------------------------------------------------------

@@ -59,6 +59,26 @@ ESTIMATED = ("exposure_stops", "sharpness", "noise")  # from photos: what they s
 USUAL = 0.95  # share of the undisturbed scenes that must lie within a limit on an estimate
 
 
+def by_reach(results: list) -> dict[str, Any]:
+    """Per-frame scores of the path that leaves the photos, read off at fixed distances from their hull."""
+    levels = [0.0, *REACHES]
+    scores = {
+        m: {k: np.full((len(levels), len(results)), np.nan) for k in METRICS} for m in METHODS
+    }
+    for scene, (_, frames, reach) in enumerate(results):
+        inside = reach < 0.1
+        order = np.argsort(np.where(inside, -1.0, reach))
+        for method in METHODS:
+            for metric in METRICS:
+                y = frames[method][metric]
+                scores[method][metric][0, scene] = y[inside].mean()
+                read = np.interp(REACHES, reach[order], y[order], right=np.nan)
+                scores[method][metric][1:, scene] = read
+    listed = {m: {k: v.tolist() for k, v in row.items()} for m, row in scores.items()}
+    reached = [[x] * len(results) for x in levels]
+    return {"levels": levels, "scores": listed, "seen": {"extrapolation": reached}}
+
+
 # ---- where it breaks -----------------------------------------------------------------------------
 
 

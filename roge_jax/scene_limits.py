@@ -71,7 +71,7 @@ def about_cameras(
         if np.nanmax(left) <= row["limit"]:
             which = "longer" if error > 0 else "shorter"
             text = f"matched photos fit focal lengths at least {100 * abs(error):.2g} % {which} than given"
-            fix = f"{cure} the focal lengths"
+            fix = f"{cure} the focal lengths, or the poses"
             return [entry("focal", 100 * abs(error), focal, text, fix, " %")]
     off = matching.photo_misfits(matching.misfits(matches, cameras), ids)
     wrong = int((off > row["limit"]).sum())
