@@ -12,7 +12,7 @@ CODE := roge_jax tests experiments
 # Experiments that draw something; stored sampling grids come first, because the charts use them. Left out: parts of other
 # experiments, and comparisons with PyTorch (`make compare`).
 PARTS := experiments/plan_report.py experiments/plan_runs.py experiments/robustness_report.py \
-	experiments/training_curves.py
+	experiments/robustness_matching.py experiments/training_curves.py
 COMPARISONS := experiments/dit_speed.py experiments/vae_speed.py experiments/real_size.py
 FIGURES := experiments/optimise_schedules.py \
 	$(filter-out experiments/optimise_schedules.py $(PARTS) $(COMPARISONS),$(wildcard experiments/*.py))

@@ -15,7 +15,8 @@ scenes' own difficulty cancels. A method *breaks* where its mean PSNR has lost 1
 levels, with a bootstrap interval; a second break is where it falls below `nearest` under the same disturbance.
 With --limits the earlier 1 dB break of the two outputs, in units of what can be seen at run time (`roge_jax.limits`),
 becomes the limit of the warning; where a limit is an estimate from the photos and more than 5 % of 200 undisturbed
-scenes lie beyond it, it moves outwards to their 95 % quantile. The published system reports no such curves. Our numbers: docs/robustness.md.
+scenes lie beyond it, it moves outwards to their 95 % quantile. What wrong poses and focal lengths show in matched photos
+is measured without the network (`robustness_matching`). `--only` measures some of it again and keeps the rest. The published system reports no such curves. Our numbers: docs/robustness.md.
 """
 
 import argparse
@@ -30,17 +31,20 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+import robustness_matching
 from robustness_report import (
     ESTIMATED,
     KNOBS,
     LOSS,
     METHODS,
     METRICS,
-    REACHES,
     RESAMPLES,
     SHOWN,
+    SHRUNK,
     breaks,
+    by_reach,
     draw,
+    jpeg_row,
     limit_rows,
     summary,
     write_limits,
@@ -58,7 +62,7 @@ from roge_jax.data.procedural import (
 from roge_jax.data.raycast import render_views
 from roge_jax.errors import LimitWarning
 from roge_jax.geometry.cameras import Cameras
-from roge_jax.geometry.crops import resize
+from roge_jax.geometry.crops import resize, scale_K
 from roge_jax.metrics import baselines, image, report
 
 OUT = Path(__file__).parent / "results"
@@ -91,13 +95,15 @@ class Place:
         )
         self.rgb, self.depth = self.render(self.K, self.c2w)
 
-    def render(self, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def render(
+        self, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         found = _render(
             np.int32(self.seed),
             textures(),
             K.astype(np.float32),
             c2w.astype(np.float32),
-            *self.size,
+            *(size or self.size),
         )
         rgb, depth = (np.asarray(x) for x in found)
         return np.round(255 * rgb).astype(np.float32) / 255.0, depth
@@ -106,6 +112,13 @@ class Place:
         photos, targets = np.asarray(photos), np.asarray(targets)
         context, target = (Cameras(self.K[i], self.c2w[i]) for i in (photos, targets))
         return Case(self.rgb[photos], context, target, self.rgb[targets], self.depth[targets])
+
+    @functools.cache  # noqa: B019 (places live as long as the program)
+    def large(self, times: int) -> np.ndarray:
+        """The photos at `times` the model's size, [3, times h, times w, 3]."""
+        size = times * self.size[0], times * self.size[1]
+        K, c2w = scale_K(self.K, self.size, size)[spread(3)], self.c2w[spread(3)]
+        return self.render(K, c2w, size)[0]
 
     def zoomed(self, ratio: float) -> Case:
         case = self.case(spread(3))
@@ -157,8 +170,10 @@ def disturbed(place: Place, knob: str, level: float) -> Case:
         return base._replace(images=perturb.add_noise(base.images, level, rng))
     if knob == "blur":
         return base._replace(images=perturb.blur(base.images, level))
-    if knob == "jpeg":
-        return base._replace(images=perturb.jpeg(base.images, int(level)))
+    if knob in SHRUNK:
+        large = place.large(SHRUNK[knob]) if SHRUNK[knob] > 1 else base.images
+        coded = large if level == KNOBS[knob].still else perturb.jpeg(large, int(level))
+        return base._replace(images=np.stack([resize(x, *place.size) for x in coded]))
     if knob == "exposure":
         stops = level * rng.permutation([-0.5, 0.0, 0.5])
         return base._replace(images=perturb.expose(base.images, stops))
@@ -253,12 +268,21 @@ def undisturbed(height: int, width: int) -> dict[str, list[float]]:
     return found
 
 
-def measure(runner: Runner, seeds: list[int], workers: int) -> dict[str, dict[str, Any]]:
+def measure(
+    runner: Runner, seeds: list[int], workers: int, knobs: list[str]
+) -> dict[str, dict[str, Any]]:
     """{knob: {"levels": [..], "scores": {method: {metric: [levels, scenes]}}, "seen": {..}}}, undisturbed first."""
     size = (runner.config.height, runner.config.width)
     places = [Place(seed, *size) for seed in seeds]
-    turned = [name for name in KNOBS if name != "extrapolation"]
-    jobs = [("still", 0.0), ("extrapolation", 0.0)]
+    turned = [name for name in knobs if name != "extrapolation"]
+    # Photos that are shrunk are not those rendered at the model's size: they have an undisturbed case of their own.
+    first = {
+        knob: (knob, KNOBS[knob].still) if SHRUNK.get(knob, 1) > 1 else ("still", 0.0)
+        for knob in turned
+    }
+    jobs = [("extrapolation", 0.0)] * ("extrapolation" in knobs) + list(
+        dict.fromkeys(first.values())
+    )
     jobs += [(knob, level) for knob in turned for level in KNOBS[knob].levels]
 
     def work(job):
@@ -267,7 +291,8 @@ def measure(runner: Runner, seeds: list[int], workers: int) -> dict[str, dict[st
         return case, runner.scores(case)
 
     began = time.perf_counter()
-    for m in (1, 2, 3, 4, 6):  # compile one by one: threads share what is compiled
+    used = {len(disturbed(places[0], *job).images) for job in jobs if job[0] != "still"}
+    for m in sorted(used | {3}):  # compile one by one: threads share what is compiled
         runner.videos(places[0].case(spread(m)))
     print(f"compiled in {time.perf_counter() - began:.0f} s", flush=True)
     results: dict[tuple, list] = {}
@@ -297,31 +322,10 @@ def measure(runner: Runner, seeds: list[int], workers: int) -> dict[str, dict[st
     found = {}
     for knob in turned:
         levels = [KNOBS[knob].still, *KNOBS[knob].levels]
-        found[knob] = {"levels": levels} | collect(
-            [("still", 0.0), *((knob, x) for x in levels[1:])]
-        )
-    found["extrapolation"] = by_reach(results["extrapolation", 0.0])
+        found[knob] = {"levels": levels} | collect([first[knob], *((knob, x) for x in levels[1:])])
+    if "extrapolation" in knobs:
+        found["extrapolation"] = by_reach(results["extrapolation", 0.0])
     return found
-
-
-def by_reach(results: list) -> dict[str, Any]:
-    """Per-frame scores of the path that leaves the photos, read off at fixed distances from their hull."""
-    levels = [0.0, *REACHES]
-    scores = {
-        m: {k: np.full((len(levels), len(results)), np.nan) for k in METRICS} for m in METHODS
-    }
-    for scene, (_, frames, reach) in enumerate(results):
-        inside = reach < 0.1
-        order = np.argsort(np.where(inside, -1.0, reach))
-        for method in METHODS:
-            for metric in METRICS:
-                y = frames[method][metric]
-                scores[method][metric][0, scene] = y[inside].mean()
-                read = np.interp(REACHES, reach[order], y[order], right=np.nan)
-                scores[method][metric][1:, scene] = read
-    listed = {m: {k: v.tolist() for k, v in row.items()} for m, row in scores.items()}
-    reached = [[x] * len(results) for x in levels]
-    return {"levels": levels, "scores": listed, "seen": {"extrapolation": reached}}
 
 
 # ---- the program ---------------------------------------------------------------------------------
@@ -345,38 +349,56 @@ def main() -> None:
     p.add_argument("--limits", action="store_true", help=f"also write {limits.TABLE.name}")
     p.add_argument("--workers", type=int, default=4, help="cases at a time (default: 4)")
     p.add_argument("--draw", action="store_true", help="only draw the stored results again")
+    again = f"measure only these again, with commas: {', '.join(KNOBS)}, matching (no network); the rest is kept"
+    p.add_argument("--only", help=again, metavar="KNOBS")
     args = p.parse_args()
     warnings.simplefilter("ignore", LimitWarning)
     file = OUT / "robustness.json"
-    if args.draw:
-        document = json.loads(file.read_text())
-    else:
-        entry.enable_cache()
-        began = time.perf_counter()
+    names = [*KNOBS, "matching"] if args.only is None else args.only.split(",")
+    if unknown := set(names) - {*KNOBS, "matching"}:
+        p.error(f"--only {args.only}: there is no {', '.join(sorted(unknown))}")
+    names = [] if args.draw else names
+    stored = json.loads(file.read_text()) if args.draw or args.only else {}
+    entry.enable_cache()
+    began = time.perf_counter()
+    document, found = stored, numbers(stored.get("knobs", {}))
+    if any(name in KNOBS for name in names):
         seeds = [HELDOUT_SEED + i for i in range(args.scenes)]
         runner = Runner(args.checkpoint)
-        found = measure(runner, seeds, args.workers)
-        found = json.loads(json.dumps(found).replace("NaN", "null"))
-        document = {
-            "settings": {
-                "checkpoint": args.checkpoint,
-                "weights": fingerprint(args.checkpoint),
-                "model": runner.config.name,
-                "size": [runner.config.height, runner.config.width],
-                "seeds": seeds,
-                "sampler": vars(runner.settings),
-                "loss_db": LOSS,
-                "bootstrap": {"resamples": RESAMPLES, "level": report.LEVEL, "over": "scenes"},
-                "metrics": {name: image.SETTINGS[name] for name in METRICS},
-            },
-            **entry.environment(),
-            "seconds": round(time.perf_counter() - began, 1),
-            "knobs": found,
-            "undisturbed": undisturbed(runner.config.height, runner.config.width),
+        settings = {
+            "checkpoint": args.checkpoint,
+            "weights": fingerprint(args.checkpoint),
+            "model": runner.config.name,
+            "size": [runner.config.height, runner.config.width],
+            "seeds": seeds,
+            "sampler": vars(runner.settings),
+            "loss_db": LOSS,
+            "bootstrap": {"resamples": RESAMPLES, "level": report.LEVEL, "over": "scenes"},
+            "metrics": {name: image.SETTINGS[name] for name in METRICS},
         }
-    found = numbers(document["knobs"])
+        if stored and any(stored["settings"][k] != settings[k] for k in ("weights", "seeds")):
+            p.error(f"--only: {file.name} has other weights or scenes: measure everything again")
+        found |= measure(runner, seeds, args.workers, [name for name in names if name in KNOBS])
+        found = {name: found[name] for name in KNOBS}
+        size = (runner.config.height, runner.config.width)
+        if not stored:
+            document = {"settings": settings, "undisturbed": undisturbed(*size)}
     document["breaks"] = breaks(found)
+    if "matching" in names:
+        size = document["settings"]["size"]
+        document["matching"] = robustness_matching.measure(
+            lambda seed: Place(seed, *size), spread(3), document["breaks"], args.workers
+        )
+    made = entry.environment() | {"seconds": round(time.perf_counter() - began, 1)}
+    if stored and names:
+        document["again"] = document.get("again", {}) | {name: made for name in names}
+    elif names:
+        document |= made
+    document["knobs"] = json.loads(json.dumps(found).replace("NaN", "null"))
     document["limits"] = limit_rows(found, document["breaks"], document["undisturbed"])
+    document["limits"] |= jpeg_row(document["breaks"], len(document["settings"]["seeds"]))
+    if "matching" in document:
+        document["limits"] |= robustness_matching.rows(document["breaks"], document["matching"])
     document = rounded(document)
     OUT.mkdir(exist_ok=True)
     file.write_text(json.dumps(document, separators=(",", ":")) + "\n")
@@ -384,6 +406,8 @@ def main() -> None:
         count = len(document["settings"]["seeds"])
         draw(found, document["breaks"], metric, count, OUT / f"robustness{suffix}.png")
     text = summary(document)
+    if "matching" in document:
+        text += "\n\n" + robustness_matching.table(document["matching"], document["limits"])
     (OUT / "robustness.md").write_text(text + "\n")
     print(text)
     if args.limits:

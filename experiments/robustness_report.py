@@ -34,7 +34,10 @@ KNOBS = {
     "focal": Knob("focal length", "error of the photos, %, either sign", (5, 10, 20, 40)),
     "noise": Knob("photo noise", "standard deviation (white = 1)", (0.05, 0.1, 0.2, 0.3)),
     "blur": Knob("photo blur", "Gaussian sigma, pixels of 112", (0.5, 1, 2, 4)),
-    "jpeg": Knob("JPEG", "quality", (50, 20, 10, 5), 100, True),
+    "jpeg": Knob("JPEG", "quality", (90, 75, 50, 20, 10, 5), 100, True),
+    "jpeg2": Knob("JPEG, photo twice the size", "quality", (75, 50, 20, 5), 100, True),
+    "jpeg4": Knob("JPEG, photo 4 times the size", "quality", (50, 20, 5), 100, True),
+    "jpeg8": Knob("JPEG, photo 8 times the size", "quality", (20, 5), 100, True),
     "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.5, 1, 1.5, 2)),
     "photos": Knob("fewer photos", "photos, all distinct", (2, 1), 3),
     "more": Knob("more photos", "photos, all distinct", (4, 6), 3),
@@ -46,6 +49,7 @@ KNOBS = {
     "narrower": Knob("narrower targets", "field of view over the photos'", (0.95, 0.9, 0.8, 0.6, 0.4), 1.0, True),
 }  # fmt: skip
 
+SHRUNK = {"jpeg": 1, "jpeg2": 2, "jpeg4": 4, "jpeg8": 8}  # times the model's size
 # The run-time measure (of `roge_jax.limits`) that shows a knob, where one does.
 SHOWN = {
     "extrapolation": "extrapolation", "wider": "field_ratio", "narrower": "field_ratio",
@@ -53,6 +57,26 @@ SHOWN = {
 }  # fmt: skip
 ESTIMATED = ("exposure_stops", "sharpness", "noise")  # from photos: what they show counts as well
 USUAL = 0.95  # share of the undisturbed scenes that must lie within a limit on an estimate
+
+
+def by_reach(results: list) -> dict[str, Any]:
+    """Per-frame scores of the path that leaves the photos, read off at fixed distances from their hull."""
+    levels = [0.0, *REACHES]
+    scores = {
+        m: {k: np.full((len(levels), len(results)), np.nan) for k in METRICS} for m in METHODS
+    }
+    for scene, (_, frames, reach) in enumerate(results):
+        inside = reach < 0.1
+        order = np.argsort(np.where(inside, -1.0, reach))
+        for method in METHODS:
+            for metric in METRICS:
+                y = frames[method][metric]
+                scores[method][metric][0, scene] = y[inside].mean()
+                read = np.interp(REACHES, reach[order], y[order], right=np.nan)
+                scores[method][metric][1:, scene] = read
+    listed = {m: {k: v.tolist() for k, v in row.items()} for m, row in scores.items()}
+    reached = [[x] * len(results) for x in levels]
+    return {"levels": levels, "scores": listed, "seen": {"extrapolation": reached}}
 
 
 # ---- where it breaks -----------------------------------------------------------------------------
@@ -159,6 +183,31 @@ def limit_rows(
     return rows
 
 
+def jpeg_row(broken: dict, scenes: int) -> dict[str, dict[str, Any]]:
+    """The row `jpeg` of `limits.json`: the quality where 1 dB is lost for photos of the model's size and larger ones.
+
+    0 in `by_shrink` where no quality cost 1 dB.
+    """
+    ends = {knob: [broken[knob][m]["loses_1_db"] for m in MODELS] for knob in SHRUNK}
+    first = {knob: max(end["at"] or 0.0 for end in both) for knob, both in ends.items()}
+    earlier = max(MODELS, key=lambda m: broken["jpeg"][m]["loses_1_db"]["at"] or 0.0)
+    row = {
+        "limit": first["jpeg"],
+        "measured_limit": first["jpeg"],
+        "moved": False,
+        "broke": first["jpeg"] > 0,
+        "measure": "quality",
+        "knob": first["jpeg"],
+        "by_shrink": [[times, first[knob]] for knob, times in SHRUNK.items()],
+        "interval": broken["jpeg"][earlier]["loses_1_db"]["interval"],
+        "output": earlier,
+        "undisturbed_beyond": 0.0,
+        "undisturbed_scenes": scenes,
+        "last_level_beyond": float(KNOBS["jpeg"].levels[-1] < first["jpeg"]),
+    }
+    return {"jpeg": row}
+
+
 # ---- pictures ------------------------------------------------------------------------------------
 
 COLOURS = {"rgb_head": "#1f77b4", "generated": "#d62728", "nearest": "#7f7f7f", "plane": "#2ca02c"}
@@ -186,6 +235,11 @@ def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> Non
             style = "-" if method in MODELS else "--"
             ax.plot(levels, mean, style, color=colour, marker="o", ms=3.5, label=LABELS[method])
             ax.fill_between(levels, low, high, color=colour, alpha=0.15, lw=0)
+        for name, times in SHRUNK.items() if knobs == ("jpeg",) else ():
+            if times > 1:
+                levels, mean, *_ = joined(found, (name,), "rgb_head", metric)
+                ax.plot(levels, mean, ":", color=COLOURS["rgb_head"], lw=1)
+                ax.annotate(f"x{times}", (levels[0], mean[0]), fontsize=8, ha="right")
         for knob_name in knobs:
             for method in MODELS if metric == "psnr" else ():
                 at = broken[knob_name][method]["loses_1_db"]["at"]
@@ -258,10 +312,11 @@ def write_limits(document: dict) -> None:
             "weights": settings["weights"],
             "seeds": [settings["seeds"][0], settings["seeds"][-1]],
             "scenes": len(settings["seeds"]),
+            "again": {k: [" ".join(v["command"]), v["commit"]] for k, v in document.get("again", {}).items()},
             "criterion": f"mean PSNR {settings['loss_db']:g} dB below undisturbed, earlier of {' and '.join(MODELS)}",
         },
         "limits": document["limits"],
-    }
+    }  # fmt: skip
     limits.TABLE.write_text(json.dumps(table, indent=1) + "\n")
 
 

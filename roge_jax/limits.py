@@ -167,11 +167,7 @@ def beyond(
     found = []
 
     def report(kind: str, value: float, text: str, cure: str) -> None:
-        row = limits[kind]
-        edge = "the model loses 1 dB" if row["broke"] else "nothing was measured"
-        edge += " or more" if row.get("moved") else ""
-        message = f"{text}; beyond {row['limit']:.2g} {edge}: {cure}."
-        found.append(Beyond(kind, float(value), float(row["limit"]), message))
+        found.append(entry(kind, value, limits[kind], text, cure))
 
     def frames(outside: np.ndarray) -> str:
         which = np.flatnonzero(outside)
@@ -229,6 +225,16 @@ def beyond(
             text = f"{which} {'are' if len(grainy) > 1 else 'is'} noisy (deviation {amount.max():.2g}, white being 1)"
             report("noise", amount.max(), text, "take photos in more light or leave them out")
     return found
+
+
+def entry(
+    kind: str, value: float, row: dict[str, Any], text: str, cure: str, unit: str = ""
+) -> Beyond:
+    """What lies beyond the limit of a `row` of the table, said in one sentence."""
+    edge = "the model loses 1 dB" if row["broke"] else "nothing was measured"
+    edge += " or more" if row.get("moved") else ""
+    message = f"{text}; beyond {row['limit']:.2g}{unit} {edge}: {cure}."
+    return Beyond(kind, float(value), float(row["limit"]), message)
 
 
 def warn(

@@ -222,26 +222,10 @@ def load_weights(args: argparse.Namespace, mesh=None):
 # ---- outputs -------------------------------------------------------------------------------------
 
 
-def transforms(names: list[str], cameras, height: int, width: int) -> dict[str, Any]:
-    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
-    from .geometry.cameras import opencv_to_opengl
-
-    frames = []
-    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {
-            "file_path": f"frames/{name}",
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
-        }
-        frames.append(entry | {"transform_matrix": pose})
-    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
-
-
 def write_outputs(folder: Path, result, photos, fps: float) -> None:
     """All files but run.json."""
     from . import video_io
+    from .geometry.paths import transforms
 
     height, width = result.frames.shape[1:3]
     names = video_io.write_frames(folder / "frames", result.frames)
@@ -300,6 +284,7 @@ def main(args: argparse.Namespace) -> None:
 
     from . import sampling
     from .core import sharding
+    from .scene_limits import Beside
 
     settings = sampling.Settings(
         steps=args.steps or 0,
@@ -319,6 +304,7 @@ def main(args: argparse.Namespace) -> None:
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
             params, _ = load_weights(args, mesh)
+        beside = Beside(scene, photos.ids, config)
         print(
             f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
         )
@@ -337,9 +323,11 @@ def main(args: argparse.Namespace) -> None:
                     settings=settings,
                 )
             print(plan.explain())
+        stage = beside.before_work(clock)
         result = sampling.sample(
-            params, config, photos, path, settings, plan=plan, stage=clock, progress=True
+            params, config, photos, path, settings, plan=plan, stage=stage, progress=True
         )
+        result = dataclasses.replace(result, warnings=(*result.warnings, *beside.tell()))
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
         with clock("write"):

@@ -34,6 +34,7 @@ ALLOWED = {
     "cost": _PARTS | {"model"},
     "limits": _BASE,
     "choices": _BASE,
+    "scene_limits": _BASE | {"data", "limits"},
     "training": _PARTS
     | {"model", "preview", "weights", "data", "metrics", "checkpoint", "cost", "folders"},
     "windows": _PARTS | {"model"},

@@ -61,7 +61,7 @@ def test_orders_on_prothero_robinson_and_their_reduction(rate, family, stages, o
     with jax.enable_x64(True):
         problem, start = relaxation(rate)
         errors = []
-        for n in (2, 4, 8):
+        for n in (1, 2, 4):  # with 8 steps Radau's 1e-11 is rounding: a rate of 1e6 on 1e-16
             grid = np.linspace(1, 0, n + 1)
             x, report = integrate(
                 problem.velocity, start, grid, family=family, stages=stages, end_inside=False

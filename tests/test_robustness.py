@@ -249,7 +249,7 @@ def test_shipped_limits_say_where_they_come_from():
     assert {"command", "commit", "weights", "seeds", "scenes", "criterion"} <= set(
         row["provenance"]
     )
-    assert set(limits.table("mini")) == set(LIMITS)
+    assert set(limits.table("mini")) == {*LIMITS, "poses", "focal", "jpeg"}
     for kind, one in row["limits"].items():
         assert np.isfinite(one["limit"]) and isinstance(one["broke"], bool), kind
         assert one["undisturbed_beyond"] <= 0.05 and one["last_level_beyond"] >= 0.95, kind

@@ -123,6 +123,7 @@ def test_record_says_what_was_made(chain, place):
     assert run["scale"]["divisor"] == pytest.approx(info.divisor)
     assert set(run["stages"]) == {
         "load",
+        "match",
         "compile",
         "prepare",
         "sample",

@@ -20,6 +20,13 @@ HDR = (".exr", ".hdr", ".pfm")
 EXIF_ORIENTATION = 0x0112
 # EXIF orientation -> quarter turns counter-clockwise from the stored to the displayed picture.
 QUARTER_TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
+# The luminance table of ITU-T T.81, annex K, which encoders scale by a quality from 1 to 100 as libjpeg does.
+JPEG_TABLE = np.array([
+    *(16, 11, 10, 16, 24, 40, 51, 61, 12, 12, 14, 19, 26, 58, 60, 55),
+    *(14, 13, 16, 24, 40, 57, 69, 56, 14, 17, 22, 29, 51, 87, 80, 62),
+    *(18, 22, 37, 56, 68, 109, 103, 77, 24, 35, 55, 64, 81, 104, 113, 92),
+    *(49, 64, 78, 87, 103, 121, 120, 101, 72, 92, 95, 98, 112, 100, 103, 99),
+])  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,15 +94,31 @@ def read_header(file: Path) -> Header:
     return Header(size, orientation if 1 <= orientation <= 8 else 1, alpha, mode)
 
 
+def jpeg_quality(file: Path) -> int | None:
+    """The quality, 1 to 100, at which a JPEG file was written last; None for other files.
+
+    That of the libjpeg table whose steps add up to those of the file's luminance table: exact for what libjpeg wrote,
+    as coarse as that for tables of an encoder's own.
+    """
+    with _opened(file) as picture:
+        tables = getattr(picture, "quantization", None)
+    if not tables:
+        return None
+    qualities = np.arange(1, 101)
+    scales = np.where(qualities < 50, 5000 // qualities, 200 - 2 * qualities)
+    steps = np.clip((JPEG_TABLE * scales[:, None] + 50) // 100, 1, 255).sum(1)
+    return int(qualities[np.argmin(np.abs(steps - sum(tables[min(tables)])))])
+
+
 @contextlib.contextmanager
 def _opened(file: Path) -> Iterator[Any]:
     """Pillow's picture. Large ones are fine: Pillow warns of them for the sake of web servers."""
     from PIL import Image
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        with Image.open(file) as picture:
-            yield picture
+    # Not within `catch_warnings`, which two threads must not enter at a time.
+    warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+    with Image.open(file) as picture:
+        yield picture
 
 
 def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.ndarray:

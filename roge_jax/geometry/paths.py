@@ -1,6 +1,7 @@
 """Camera paths: smooth interpolation of key cameras, and path files (docs/cameras.md)."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,21 @@ def save_path(
     content: dict[str, Any] = {"convention": convention, "width": width, "height": height}
     content |= {"fps": fps} if fps else {}
     Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1))
+
+
+def transforms(names: Sequence[str], cameras: Cameras, height: int, width: int) -> dict[str, Any]:
+    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
+    frames = []
+    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
+        entry = {
+            "file_path": f"frames/{name}",
+            "fl_x": K[0, 0],
+            "fl_y": K[1, 1],
+            "cx": K[0, 2],
+            "cy": K[1, 2],
+        }
+        frames.append(entry | {"transform_matrix": pose})
+    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
 
 
 def load_path(
