@@ -4,6 +4,7 @@ import contextlib
 import contextvars
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -62,7 +63,7 @@ def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
     lengths, batch = (q.shape[1], k.shape[1]), q.shape[:1]
     # Always x, with the batch axes that `jax.vmap` gave q alone: JAX 0.10 knows no other batches.
     k, v = (jnp.where(True, x, q[:, :1]) for x in (k, v))
-    told = {}
+    told: dict[str, Any] = {}
     if any(n % 2 for n in lengths):
         q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (q, k, v))
         own = q[:, 0, 0, 0].astype(jnp.int32)
