@@ -94,6 +94,16 @@ def dev_data() -> Path:
     return root
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _programs_of_one_file():
+    """What a file compiled goes when it ends: programs of all files together take gigabytes in every process."""
+    yield
+    if "jax" in sys.modules:
+        import jax
+
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="module")
 def common():
     """Options of a short training run of `tiny`, see `train_runs.quick_tiny`."""
