@@ -31,9 +31,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from ablation_parts import generator, reconstruction, report
+from ablation_parts import adaptation, generator, reconstruction, report, transformer
 
-from roge_jax import checkpoint
+from roge_jax import checkpoint, model
 from roge_jax.config import preset
 from roge_jax.core.params import Tree, flatten
 from roge_jax.data.pool import read_pool
@@ -42,11 +42,13 @@ from roge_jax.data.source import ProceduralSource
 OUT = Path(__file__).resolve().parent / "results"
 
 
-def fingerprint(params: Tree) -> str:
-    """Changes with any weight."""
+def fingerprint(params: Tree, *settings: object) -> str:
+    """Changes with any weight, and with the settings."""
     digest = hashlib.sha256()
     for path, x in flatten(params).items():
         digest.update(path.encode() + np.asarray(x).tobytes())
+    for value in settings:
+        digest.update(repr(value).encode())
     return digest.hexdigest()[:12]
 
 
@@ -70,6 +72,34 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
         )
         for name, variant in reconstruction.VARIANTS.items()
     }
+    frozen = transformer.Frozen(params, config, source, scenes=args.clips)
+    about = {
+        "frozen": fingerprint(model.split(params, transformer.TRAINS)[1], config.fusion),
+        "clips": args.clips,
+        "steps": args.transformer_steps,
+    }
+    found |= {
+        name: Job(
+            "transformer",
+            about,
+            lambda v=variant: transformer.train(v, frozen, args.transformer_steps),
+        )
+        for name, variant in transformer.VARIANTS.items()
+    }
+    found |= {
+        name: Job(
+            "adaptation",
+            {"weights": weights["weights"], "steps": args.adapt_steps},
+            lambda rank=rank, ranks=ranks: adaptation.adapt(
+                params, config, args.adapt_steps, rank=rank, ranks=ranks
+            ),
+        )
+        for name, rank, ranks in (
+            ("adaptation", 32, adaptation.RANKS),
+            ("adaptation, rank 8", 8, ()),
+            ("adaptation, rank 2", 2, ()),
+        )
+    }
     return found | {
         "look-up": Job(
             "look-up",
@@ -82,7 +112,7 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
         "lora": Job(
             "lora",
             weights | {"steps": args.lora_steps},
-            lambda: generator.lora(params, config, source, args.lora_steps, scenes=args.clips),
+            lambda: adaptation.lora(params, config, source, args.lora_steps, scenes=args.clips),
         ),
         "finetune": Job(
             "finetune",
@@ -115,8 +145,7 @@ def measured(job: Job) -> dict:
 def stored(path: Path) -> dict[str, dict]:
     """The finished rows, in the order in which they are shown."""
     rows = json.loads(path.read_text())["rows"] if path.exists() else {}
-    order = [*reconstruction.VARIANTS, "look-up", "conditions", "finetune", "lora"]
-    return dict(sorted(rows.items(), key=lambda item: order.index(item[0])))
+    return dict(sorted(rows.items(), key=lambda item: report.ORDER.index(item[0])))
 
 
 def main() -> None:
@@ -128,6 +157,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=16, help="held-out, for the generator")
     parser.add_argument("--lora-steps", type=int, default=60)
     parser.add_argument("--finetune-steps", type=int, default=40)
+    parser.add_argument("--transformer-steps", type=int, default=80, help="of the base transformer")
+    parser.add_argument("--adapt-steps", type=int, default=60)
     parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")
     parser.add_argument("--redraw", action="store_true", help="only tables and chart")
     parser.add_argument("--out", type=Path, default=OUT, help="folder of ablation.{json,png}")
