@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=16, help="held-out, for the generator")
     parser.add_argument("--lora-steps", type=int, default=60)
     parser.add_argument("--finetune-steps", type=int, default=40)
-    parser.add_argument("--transformer-steps", type=int, default=80, help="of the base transformer")
+    parser.add_argument("--transformer-steps", type=int, default=60, help="of the base transformer")
     parser.add_argument("--adapt-steps", type=int, default=60)
     parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")
     parser.add_argument("--redraw", action="store_true", help="only tables and chart")

@@ -82,7 +82,7 @@ def without(clips: dict[str, np.ndarray], hide: str | None) -> dict[str, np.ndar
 class Frozen:
     """What no variant changes, encoded once: training clips and held-out ones."""
 
-    def __init__(self, params: Tree, config: RoGeConfig, source, clips: int = 96, scenes: int = 16):
+    def __init__(self, params: Tree, config: RoGeConfig, source, clips: int = 64, scenes: int = 16):
         self.params, self.config, self.source = params, config, source
         self.clips, self.scenes = clips, scenes
 
