@@ -317,6 +317,6 @@ def test_frames_kept_back_lie_between_those_that_train(monkeypatch):
 
     monkeypatch.setattr(adaptation, "sample_sequence", sequence)
     learnt, kept = adaptation.one_scene(TINY)
-    assert len(learnt["rgb"]) == len(kept["rgb"]) == adaptation.FRAMES >= 17
+    assert len(learnt["rgb"]) == len(kept["rgb"]) == adaptation.FRAMES >= adaptation.WINDOW
     for name in learnt:
         np.testing.assert_array_equal(kept[name], learnt[name] + 1)

@@ -19,10 +19,11 @@ from roge_jax.training import loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
 
 from .common import CONTEXTS, SIGMAS, Clock, heldout
-from .generator import encode_all, errors_by_sigma, told, video_stage
+from .generator import clean_latents, errors_by_sigma, told, video_stage
 
 RANKS = (0, 1, 2, 4, 8, 16, 32)
-SCENE, FRAMES, SWEEP = HELDOUT_SEED + 100, 48, (100.0, 130.0)  # of `one_scene`: degrees of its path
+# Of `one_scene`: its seed, degrees of its path, frames of either half; and frames of a window.
+SCENE, SWEEP, FRAMES, WINDOW = HELDOUT_SEED + 100, (100.0, 130.0), 48, 9
 ADAPT = OptimConfig(learning_rate=1e-3, warmup=10, decay=0.5)
 FAMILIES = {
     "generator attention": r"^dit/.*attn/",
@@ -118,30 +119,31 @@ def learn(params: Tree, config: RoGeConfig, stage: stages.Stage, source, steps: 
     return Learned(unflatten(full), unflatten(factors), count(specs), clock)
 
 
+@functools.partial(jax.jit, static_argnames="config")
+def _score(params: Tree, views: model.Views, x0, key, *, config: RoGeConfig):
+    """Flow error by noise level, and the error of the reconstruction's picture, of one sample."""
+    tokens = model.reconstruct(params, views, config=config)
+    features = model.query_rays(params, tokens, views, config=config)
+    rgb = model.decode_rgb(params, features, views, config=config)
+    clip = {"x0": x0, "known": x0[:CONTEXTS], "seen": x0[:CONTEXTS]}
+    clip |= told(params, views, features, config=config, shown=rgb[CONTEXTS:])
+    sigmas = jnp.asarray(SIGMAS, jnp.float32)
+    photometric = model.photometric(rgb, views, config=config)
+    return errors_by_sigma(params, clip, key, sigmas, config=config), photometric
+
+
 def losses(params: Tree, config: RoGeConfig, learned: Learned, batches, ranks) -> dict[str, Any]:
     """Held-out losses of every sample before, and after with each update cut to `ranks`."""
-
-    @jax.jit
-    def score(params, views, x0, key):
-        """Flow error by noise level, and that of the reconstruction's picture, of one scene."""
-        tokens = model.reconstruct(params, views, config=config)
-        features = model.query_rays(params, tokens, views, config=config)
-        clip = {"x0": x0, "known": x0[:CONTEXTS], "seen": x0[:CONTEXTS]}
-        rgb = model.decode_rgb(params, features, views, config=config)
-        clip |= told(params, views, features, config=config, shown=rgb[CONTEXTS:])
-        sigmas = jnp.asarray(SIGMAS, jnp.float32)
-        photometric = model.photometric(rgb, views, config=config)
-        return errors_by_sigma(params, clip, key, sigmas, config=config), photometric
-
-    latents = encode_all(params, batches, config)["x0"]
+    samples = [jax.tree.map(lambda x: x[0], b) for b in batches]
+    latents = [clean_latents(params, views, config=config) for views in samples]
     nothing = jax.tree.map(np.zeros_like, learned.factors)
     after, found = attach(params, learned.full), {}
     cuts = {str(r): (after, truncated(learned.factors, r)) for r in ranks}
     for name, (base, cut) in ({"before": (params, nothing)} | cuts).items():
         whole = attach(base, cut)
         rows = [
-            score(whole, jax.tree.map(lambda x: x[0], b), x0, jax.random.key(i))
-            for i, (b, x0) in enumerate(zip(batches, latents))
+            _score(whole, views, x0, jax.random.key(i), config=config)
+            for i, (views, x0) in enumerate(zip(samples, latents))
         ]
         found[name] = {
             "flow": [float(np.mean(f)) for f, _ in rows],
@@ -190,28 +192,29 @@ def adapt(
 ) -> dict:
     """The LoRA stage on one scene alone, a window a step; losses on windows of its frames kept back.
 
-    `ranks`: the update is scored cut to these too.
+    `ranks`: the update is scored cut to these too. `elsewhere` has the losses on as many other scenes.
     """
-    stage = stages.lora_stage(1, frames=config.frames)
+    config = with_rank(dataclasses.replace(config, frames=WINDOW), rank)
+    stage = stages.lora_stage(1, frames=WINDOW)
     views = dataclasses.replace(
         stage.views, contexts=(CONTEXTS,), context_weights=(1.0,), augment=False
     )
     stage = dataclasses.replace(stage, views=views, draws=4, remat="dots", optim=ADAPT)
-    config = with_rank(config, rank)
     learnt, kept = one_scene(config)
     learned = learn(params, config, stage, [learnt], steps)
     fixed = video_stage(config, batch=1)
     fixed = dataclasses.replace(fixed, views=fixed.views.undisturbed())
     batches = [stages.stage_batch([kept], fixed, config, 0, i) for i in range(windows)]
+    others = heldout(fixed, config, windows)
+    score = functools.partial(losses, params, config, learned)
     return {
         "group": "adaptation",
         "rank": rank,
         "learning_rate": ADAPT.learning_rate,
-        "scene": SCENE,
-        "sweep": SWEEP,
-        "frames": FRAMES,
+        "scene": {"seed": SCENE, "sweep": SWEEP, "frames": FRAMES, "window": WINDOW},
         "trained": learned.trained,
         "spectrum": spectrum(learned.factors),
-        "losses": losses(params, config, learned, batches, sorted({*ranks, 0, rank})),
+        "losses": score(batches, sorted({*ranks, 0, rank})),
+        "elsewhere": score(others, [rank]),
         **learned.clock.record(),
     }

@@ -66,15 +66,22 @@ def told(
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
-    """What no noise level changes: latents of all slots, and what the transformer is told."""
-    tokens = model.reconstruct(params, views, config=config)
-    features = model.query_rays(params, tokens, views, config=config)
+def clean_latents(params: Tree, views: model.Views, *, config: RoGeConfig) -> jax.Array:
+    """x0 of all slots, contexts first."""
     latents = [
         model.encode_contexts(params, views["context_rgb"], config=config),
         model.encode_targets(params, views["target_rgb"], config=config),
     ]
-    return {"x0": jnp.concatenate(latents)} | told(params, views, features, config=config)
+    return jnp.concatenate(latents)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
+    """What no noise level changes: latents of all slots, and what the transformer is told."""
+    tokens = model.reconstruct(params, views, config=config)
+    features = model.query_rays(params, tokens, views, config=config)
+    x0 = clean_latents(params, views, config=config)
+    return {"x0": x0} | told(params, views, features, config=config)
 
 
 def encode_all(params: Tree, batches, config: RoGeConfig) -> dict[str, np.ndarray]:
