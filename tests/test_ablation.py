@@ -314,11 +314,13 @@ def test_runs_at_lower_ranks_stand_below_the_cuts():
 
     row = {"group": "adaptation", "steps": 3, "spectrum": {}, "rank": 4}
     row["losses"] = losses(**{"before": [0.5, 0.6], "0": [0.4, 0.5], "4": [0.2, 0.3]})
+    row["elsewhere"] = losses(**{"before": [0.1, 0.2], "4": [0.15, 0.25]})
     low = row | {"rank": 2, "losses": losses(**{"2": [0.25, 0.35]})}
     table = report.tables({"adaptation": row, "adaptation, rank 2": low})
     assert "| untrained | 0.5500 | +0.3000 [+0.3000, +0.3000] | 2.000 |" in table
     assert "| 4 | 0.2500 |  | 2.000 |" in table
     assert "| 2, trained at 2 | 0.3000 | +0.0500 [+0.0500, +0.0500] | 2.000 |" in table
+    assert "flow error 0.1500 before, 0.2000 after, +0.0500 [+0.0500, +0.0500]." in table
 
 
 def test_frames_kept_back_lie_between_those_that_train(monkeypatch):

@@ -16,6 +16,8 @@ ORDER = (
     *("lora", "adaptation", "adaptation, rank 8", "adaptation, rank 2"),
 )
 
+WHERE = {"lora": "training scenes", "adaptation": "one scene"}  # what LoRA was trained on
+
 
 def scores(row: dict) -> np.ndarray:
     """One number per held-out scene, higher is better: PSNR, or the flow error over all noise levels, negated."""
@@ -178,6 +180,11 @@ def _ranks_table(row: dict, outright: dict[str, dict]) -> list[str]:
             f"| {label} | {np.mean(loss['flow']):.4f} | {change if label != whole else ''} | "
             f"{1000 * np.mean(loss['photometric']):.3f} |"
         )
+    if "elsewhere" in row:
+        before, after = (row["elsewhere"][name]["flow"] for name in ("before", whole))
+        change = _interval(bootstrap(np.subtract(after, before)), 4)
+        told = f"flow error {np.mean(before):.4f} before, {np.mean(after):.4f} after, {change}"
+        lines += ["", f"On {len(before)} other scenes, the same update: {told}."]
     return lines
 
 
@@ -199,17 +206,11 @@ def tables(rows: dict[str, dict]) -> str:
     transformers = ready(rows, "transformer")
     if transformers:
         parts.append(_transformer_table(transformers))
-    for name, what in (
-        ("lora", "LoRA on the training scenes"),
-        ("adaptation", "LoRA on one scene"),
-    ):
+    for name, where in WHERE.items():
         if name in rows:
             row = rows[name]
-            parts.append(
-                [
-                    f"{what}, {row['steps']} steps, {len(row['losses']['0']['flow'])} held-out samples:"
-                ]
-            )
+            count = len(row["losses"]["0"]["flow"])
+            parts.append([f"LoRA on {where}, {row['steps']} steps, {count} held-out samples:"])
             parts.append(_spectrum_table(row))
             parts.append(_ranks_table(row, lower_ranks(rows) if name == "adaptation" else {}))
     missing = [n for n in ORDER if n not in rows]
@@ -346,7 +347,7 @@ def _spectrum(ax, row: dict) -> None:
     ax.set(xscale="log", yscale="log", xlabel="singular value", ylabel="size over the largest")
     ax.set_ylim(bottom=1e-3)
     ax.set_title(
-        f"LoRA update of rank {row['rank']}, mean of the layers ({row['group']})", fontsize=10
+        f"LoRA update of rank {row['rank']}, mean of the layers; {WHERE[row['group']]}", fontsize=10
     )
     ax.set_xticks([1, 2, 4, 8, 16, 32], ["1", "2", "4", "8", "16", "32"])
     ax.minorticks_off()
@@ -374,6 +375,6 @@ def _ranks(ax, row: dict, outright: dict[str, dict]) -> None:
     ax.axhline(0, color="k", lw=0.8)
     ax.set_xticks(range(len(names)), ["un-\ntrained" if n == "before" else n for n in names])
     ax.set(xlabel="rank kept", ylabel="held-out loss above the full update (%)")
-    ax.set_title(f"the update cut to lower rank ({row['group']})", fontsize=10)
+    ax.set_title(f"the update cut to lower rank; {WHERE[row['group']]}", fontsize=10)
     ax.grid(True, alpha=0.3)
     ax.legend(fontsize=8)
