@@ -3,9 +3,9 @@
     OPENBLAS_NUM_THREADS=1 NPROC=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false taskset -c 0 \\
         python experiments/ablation.py --data runs/pool         # results/ablation.{json,png}, docs/ablation.md
 
-CPU, about an hour on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
+CPU, about two hours on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
 settings or the shipped weights that they measure have changed; several processes may share the work, each on its core
-with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Five groups:
+with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Seven groups:
 
   reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, 3 photos), every variant for the FLOPs of 80
                   steps of the base; PSNR of the RGB head on 32 held-out scenes, paired with the base
@@ -13,8 +13,11 @@ with its own `--only`. Without `--data` scenes are rendered as they are needed. 
   conditions      the shipped generator: held-out flow error by noise level with a condition zeroed or taken from
                   another scene, the same noise for all
   finetune        the shipped generator trained on for equal steps while a condition is absent: what it can replace
+  transformer     `generator` from nothing on the shipped reconstruction, every size of the transformer for the FLOPs
+                  of 60 steps of the base (2 clips x 4 noise levels); held-out flow error, paired with the base
   lora            the LoRA stage at rank 32 on the shipped model: singular values of the update, and the held-out loss
                   with the update cut to lower ranks
+  adaptation      the same on one scene, scored on frames kept back; and trained at lower ranks outright
 
 The published system reports no such ablation. Our numbers and what they are worth: docs/ablation.md.
 """
