@@ -332,3 +332,17 @@ def test_frames_kept_back_lie_between_those_that_train(monkeypatch):
     assert len(learnt["rgb"]) == len(kept["rgb"]) == adaptation.FRAMES >= adaptation.WINDOW
     for name in learnt:
         np.testing.assert_array_equal(kept[name], learnt[name] + 1)
+
+
+@pytest.mark.slow
+def test_an_adaptation_is_scored_here_and_elsewhere():
+    params = model.init(jax.random.key(0), PLAIN)
+    head = params["dit"]["head"]["linear"]  # zero at first: nothing that LoRA changes would show
+    head["kernel"] = 0.1 * jax.random.normal(jax.random.key(1), head["kernel"].shape)
+    row = adaptation.adapt(params, PLAIN, 3, rank=4, ranks=(2,), windows=2)
+    assert list(row["losses"]) == ["before", "0", "2", "4"]
+    assert list(row["elsewhere"]) == ["before", "4"]
+    flow = {name: np.array(loss["flow"]) for name, loss in row["losses"].items()}
+    assert all(f.shape == (2,) for f in flow.values())
+    assert all(np.all(flow[n] != flow["4"]) for n in ("before", "0", "2"))
+    assert report.tables({"adaptation": row})
