@@ -161,7 +161,7 @@ def main() -> None:
     parser.add_argument("--lora-steps", type=int, default=60)
     parser.add_argument("--finetune-steps", type=int, default=40)
     parser.add_argument("--transformer-steps", type=int, default=60, help="of the base transformer")
-    parser.add_argument("--adapt-steps", type=int, default=60)
+    parser.add_argument("--adapt-steps", type=int, default=40)
     parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")
     parser.add_argument("--redraw", action="store_true", help="only tables and chart")
     parser.add_argument("--out", type=Path, default=OUT, help="folder of ablation.{json,png}")
