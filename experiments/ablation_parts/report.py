@@ -300,9 +300,9 @@ def _variants(ax, rows: dict[str, dict], unit: float, word: str) -> None:
     for verdict_, colour in COLOURS.items():
         ax.plot([], [], "o", color=colour, label=verdict_.strip("()"))
     ax.set_yticks(range(len(names)), labels, fontsize=9)
-    ax.set_ylim(-0.7, len(names) - 0.3)
+    ax.set_ylim(-0.7, len(names) + 0.4)  # room for the legend
     ax.grid(True, axis="x", alpha=0.3)
-    ax.legend(fontsize=8, loc="best")
+    ax.legend(fontsize=7, ncols=3, loc="upper center", columnspacing=0.8)
 
 
 def _conditions(ax, row: dict) -> None:
