@@ -3,9 +3,9 @@
     OPENBLAS_NUM_THREADS=1 NPROC=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false taskset -c 0 \\
         python experiments/ablation.py --data runs/pool         # results/ablation.{json,png}, docs/ablation.md
 
-CPU, about an hour on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
+CPU, about two hours on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
 settings or the shipped weights that they measure have changed; several processes may share the work, each on its core
-with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Five groups:
+with its own `--only`. Without `--data` scenes are rendered as they are needed. Seeds 0 and 1. Seven groups:
 
   reconstruction  `recon_low` from nothing (32x56, 8 scenes x 4 targets, 3 photos), every variant for the FLOPs of 80
                   steps of the base; PSNR of the RGB head on 32 held-out scenes, paired with the base
@@ -13,8 +13,11 @@ with its own `--only`. Without `--data` scenes are rendered as they are needed. 
   conditions      the shipped generator: held-out flow error by noise level with a condition zeroed or taken from
                   another scene, the same noise for all
   finetune        the shipped generator trained on for equal steps while a condition is absent: what it can replace
+  transformer     `generator` from nothing on the shipped reconstruction, every size of the transformer for the FLOPs
+                  of 60 steps of the base (2 clips x 4 noise levels); held-out flow error, paired with the base
   lora            the LoRA stage at rank 32 on the shipped model: singular values of the update, and the held-out loss
                   with the update cut to lower ranks
+  adaptation      the same on one scene, scored on frames kept back; and trained at lower ranks outright
 
 The published system reports no such ablation. Our numbers and what they are worth: docs/ablation.md.
 """
@@ -31,9 +34,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
-from ablation_parts import generator, reconstruction, report
+from ablation_parts import adaptation, generator, reconstruction, report, transformer
 
-from roge_jax import checkpoint
+from roge_jax import checkpoint, model
 from roge_jax.config import preset
 from roge_jax.core.params import Tree, flatten
 from roge_jax.data.pool import read_pool
@@ -42,11 +45,13 @@ from roge_jax.data.source import ProceduralSource
 OUT = Path(__file__).resolve().parent / "results"
 
 
-def fingerprint(params: Tree) -> str:
-    """Changes with any weight."""
+def fingerprint(params: Tree, *settings: object) -> str:
+    """Changes with any weight, and with the settings."""
     digest = hashlib.sha256()
     for path, x in flatten(params).items():
         digest.update(path.encode() + np.asarray(x).tobytes())
+    for value in settings:
+        digest.update(repr(value).encode())
     return digest.hexdigest()[:12]
 
 
@@ -70,6 +75,34 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
         )
         for name, variant in reconstruction.VARIANTS.items()
     }
+    frozen = transformer.Frozen(params, config, source, scenes=args.clips)
+    about = {
+        "frozen": fingerprint(model.split(params, transformer.TRAINS)[1], config.fusion),
+        "clips": args.clips,
+        "steps": args.transformer_steps,
+    }
+    found |= {
+        name: Job(
+            "transformer",
+            about,
+            lambda v=variant: transformer.train(v, frozen, args.transformer_steps),
+        )
+        for name, variant in transformer.VARIANTS.items()
+    }
+    found |= {
+        name: Job(
+            "adaptation",
+            {"weights": weights["weights"], "steps": args.adapt_steps},
+            lambda rank=rank, ranks=ranks: adaptation.adapt(
+                params, config, args.adapt_steps, rank=rank, ranks=ranks
+            ),
+        )
+        for name, rank, ranks in (
+            ("adaptation", 32, adaptation.RANKS),
+            ("adaptation, rank 8", 8, ()),
+            ("adaptation, rank 2", 2, ()),
+        )
+    }
     return found | {
         "look-up": Job(
             "look-up",
@@ -82,7 +115,7 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
         "lora": Job(
             "lora",
             weights | {"steps": args.lora_steps},
-            lambda: generator.lora(params, config, source, args.lora_steps, scenes=args.clips),
+            lambda: adaptation.lora(params, config, source, args.lora_steps, scenes=args.clips),
         ),
         "finetune": Job(
             "finetune",
@@ -115,8 +148,7 @@ def measured(job: Job) -> dict:
 def stored(path: Path) -> dict[str, dict]:
     """The finished rows, in the order in which they are shown."""
     rows = json.loads(path.read_text())["rows"] if path.exists() else {}
-    order = [*reconstruction.VARIANTS, "look-up", "conditions", "finetune", "lora"]
-    return dict(sorted(rows.items(), key=lambda item: order.index(item[0])))
+    return dict(sorted(rows.items(), key=lambda item: report.ORDER.index(item[0])))
 
 
 def main() -> None:
@@ -128,6 +160,8 @@ def main() -> None:
     parser.add_argument("--clips", type=int, default=16, help="held-out, for the generator")
     parser.add_argument("--lora-steps", type=int, default=60)
     parser.add_argument("--finetune-steps", type=int, default=40)
+    parser.add_argument("--transformer-steps", type=int, default=60, help="of the base transformer")
+    parser.add_argument("--adapt-steps", type=int, default=40)
     parser.add_argument("--only", nargs="+", help="names or groups, such as conditions lora")
     parser.add_argument("--redraw", action="store_true", help="only tables and chart")
     parser.add_argument("--out", type=Path, default=OUT, help="folder of ablation.{json,png}")

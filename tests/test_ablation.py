@@ -1,8 +1,10 @@
 """The ablation: what it changes is what it says, its rank arithmetic, its verdicts."""
 
 import dataclasses
+import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -10,7 +12,7 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "experiments"))
 
-from ablation_parts import common, generator, reconstruction, report
+from ablation_parts import adaptation, common, generator, reconstruction, report, transformer
 
 from roge_jax import model
 from roge_jax.config import preset
@@ -37,7 +39,7 @@ def product(lora):
 
 def test_factored_singular_values_are_those_of_the_product():
     lora = factors()
-    u, s, vt = generator.factor_svd(*lora["dit"]["blocks"]["ffn"]["fc1"].values())
+    u, s, vt = adaptation.factor_svd(*lora["dit"]["blocks"]["ffn"]["fc1"].values())
     want = np.linalg.svd(product(lora), compute_uv=False)
     np.testing.assert_allclose(s, want[:, :6], rtol=1e-10)
     np.testing.assert_allclose(u * s[:, None] @ vt, product(lora), atol=1e-10)
@@ -46,7 +48,7 @@ def test_factored_singular_values_are_those_of_the_product():
 @pytest.mark.parametrize("rank", [0, 2, 6])
 def test_a_truncated_update_is_the_best_of_its_rank(rank):
     lora = factors()
-    cut = generator.truncated(lora, rank)
+    cut = adaptation.truncated(lora, rank)
     shapes = [{p: x.shape for p, x in flatten(t).items()} for t in (cut, lora)]
     assert shapes[0] == shapes[1]
     full = np.linalg.svd(product(lora), compute_uv=False)
@@ -56,7 +58,7 @@ def test_a_truncated_update_is_the_best_of_its_rank(rank):
 
 def test_a_layer_narrower_than_the_rank_keeps_its_shapes():
     lora = factors(rank=12)
-    cut = generator.truncated(lora, 12)
+    cut = adaptation.truncated(lora, 12)
     np.testing.assert_allclose(product(cut), product(lora), atol=1e-4)
 
 
@@ -64,7 +66,7 @@ def test_spectrum_of_a_known_update():
     u = np.linalg.qr(np.random.default_rng(0).standard_normal((10, 4)))[0]
     a, b = u * np.array([4.0, 2.0, 0.0, 0.0]), np.eye(4, 8)
     lora = {"dit": {"blocks": {"ffn": {"fc1": {"lora_a": a[None], "lora_b": b[None]}}}}}
-    found = generator.spectrum(lora)
+    found = adaptation.spectrum(lora)
     assert list(found) == ["generator MLP"]
     row = found["generator MLP"]
     np.testing.assert_allclose(row["relative"], [1, 0.5, 0, 0], atol=1e-12)
@@ -74,9 +76,9 @@ def test_spectrum_of_a_known_update():
 
 def test_every_adapted_layer_of_the_transformer_blocks_has_a_family():
     paths = [p for p in flatten(model.adapter_specs(preset("mini"))) if p.endswith("lora_a")]
-    rules = generator.FAMILIES.values()
+    rules = adaptation.FAMILIES.values()
     blocks = [p for p in paths if "blocks/" in p]
-    hits = [sum(bool(generator.re.search(rule, p)) for rule in rules) for p in blocks]
+    hits = [sum(bool(re.search(rule, p)) for rule in rules) for p in blocks]
     assert blocks and set(hits) == {1}
 
 
@@ -223,3 +225,124 @@ def test_the_look_up_stands_beside_the_rgb_head(monkeypatch):
     }
     table = report.tables(rows | {"look-up": made})
     assert "| 3 | 15.00 | 16.00 | 17.00 | +2.00 [+2.00, +2.00] |" in table
+
+
+# TINY without a prompt, which `mini` has not either.
+PLAIN = dataclasses.replace(TINY, dit=dataclasses.replace(TINY.dit, text_len=0))
+
+
+def test_transformers_of_all_sizes_get_the_same_budget():
+    mini = preset("mini")
+    flops = {n: transformer.step_flops(v, mini) for n, v in transformer.VARIANTS.items()}
+    base = flops["transformer"]
+    assert flops["transformer, seed 1"] == base
+    for part, middle in (("depth", mini.dit.depth), ("width", mini.dit.width)):
+        names = [n for n in flops if part in n]
+        for name in names:
+            assert (flops[name] > base) == (int(name.split()[-1]) > middle)
+        assert len(names) == 2
+    assert 0.9 * base < flops["transformer without rays"] < base
+
+
+def test_every_transformer_variant_differs_from_the_base_in_what_it_says():
+    mini = preset("mini")
+    base = dataclasses.asdict(mini.dit)
+    whole = flatten(transformer.trained_specs(mini, transformer.VARIANTS["transformer"]))
+    for name, variant in transformer.VARIANTS.items():
+        dit = dataclasses.asdict(transformer.varied(mini, variant).dit)
+        changed = {k for k in base if dit[k] != base[k]}
+        assert changed == {"width": {"width", "heads", "ffn"}, "depth": {"depth"}}.get(
+            variant.question, set()
+        )
+        assert dit["width"] // dit["heads"] == 64 and dit["ffn"] == 4 * dit["width"]
+        gone = whole.keys() - flatten(transformer.trained_specs(mini, variant)).keys()
+        assert {p.rpartition("/")[0] for p in gone} == (
+            {"fusion/rays_embed"} if name == "transformer without rays" else set()
+        )
+
+
+@pytest.mark.slow
+def test_a_transformer_learns_from_stored_clips_and_is_scored():
+    params = model.init(jax.random.key(0), PLAIN)
+    source = ProceduralSource(TINY.height, TINY.width, 24)
+    frozen = transformer.Frozen(params, PLAIN, source, clips=3, scenes=2)
+    row = transformer.train(transformer.VARIANTS["transformer"], frozen, 6)
+    assert row["skipped"] == 0 and np.shape(row["errors"]) == (2, len(common.SIGMAS))
+    assert np.mean(row["errors"]) < np.mean(row["untrained"])
+
+
+def test_a_transformer_without_rays_never_sees_them():
+    rng, m = np.random.default_rng(0), common.CONTEXTS
+    slots, views = PLAIN.slots(m), m + PLAIN.frames
+    shapes = {"x0": (slots, *PLAIN.latent_size, 16), "features": (views, 4, 6, 32)}
+    clips = {n: rng.standard_normal((2, *s)).astype(np.float32) for n, s in shapes.items()}
+    clips |= {"known": clips["x0"][:, :m], "seen": clips["x0"][:, :m]}
+    clips["rays"] = np.full((2, views, PLAIN.height, PLAIN.width, 6), np.nan, np.float32)
+    frozen = SimpleNamespace(config=PLAIN, clips=2, training=clips, heldout=clips)
+    row = transformer.train(transformer.VARIANTS["transformer without rays"], frozen, 6)
+    assert row["skipped"] == 0 and row["steps"] > 6  # the budget of six with rays
+    assert np.mean(row["errors"]) < np.mean(row["untrained"])
+
+
+def made_up_transformer(errors, question="depth"):
+    return {"group": "transformer", "question": question, "reference": "transformer"} | {
+        "errors": np.asarray(errors).tolist(), "untrained": [0.5, 0.7], "halfway": 0.4,
+        "parameters": 1e6, "steps": 3, "core_seconds": 1.0,
+    }  # fmt: skip
+
+
+def test_a_lower_flow_error_is_better():
+    base = np.array([[0.2, 0.4], [0.3, 0.5]])
+    rows = {
+        "transformer": made_up_transformer(base, "seed"),
+        "transformer, seed 1": made_up_transformer(base + 0.002, "seed"),
+        "transformer depth 4": made_up_transformer(base - 0.03),
+        "transformer depth 12": made_up_transformer(base + 0.04),
+    }
+    assert report.seed_noise(rows) == pytest.approx(0.002)
+    assert report.difference(rows, "transformer depth 4")["mean"] == pytest.approx(0.031)
+    lines = report.tables(rows).splitlines()
+    low, high = (next(x for x in lines if f"depth {d} " in x) for d in (4, 12))
+    assert "-0.0310 [-0.0310, -0.0310]" in low and low.endswith("better |")
+    assert "+0.0390 [+0.0390, +0.0390]" in high and high.endswith("worse |")
+    assert "before any step: 0.6000." in report.tables(rows)
+
+
+def test_runs_at_lower_ranks_stand_below_the_cuts():
+    def losses(**flow):
+        return {k: {"flow": v, "photometric": [0.001, 0.003]} for k, v in flow.items()}
+
+    row = {"group": "adaptation", "steps": 3, "spectrum": {}, "rank": 4}
+    row["losses"] = losses(**{"before": [0.5, 0.6], "0": [0.4, 0.5], "4": [0.2, 0.3]})
+    row["elsewhere"] = losses(**{"before": [0.1, 0.2], "4": [0.15, 0.25]})
+    low = row | {"rank": 2, "losses": losses(**{"2": [0.25, 0.35]})}
+    table = report.tables({"adaptation": row, "adaptation, rank 2": low})
+    assert "| untrained | 0.5500 | +0.3000 [+0.3000, +0.3000] | 2.000 |" in table
+    assert "| 4 | 0.2500 |  | 2.000 |" in table
+    assert "| 2, trained at 2 | 0.3000 | +0.0500 [+0.0500, +0.0500] | 2.000 |" in table
+    assert "flow error 0.1500 before, 0.2000 after, +0.0500 [+0.0500, +0.0500]." in table
+
+
+def test_frames_kept_back_lie_between_those_that_train(monkeypatch):
+    def sequence(seed, *, frames, **_):
+        return {"rgb": np.arange(frames), "K": np.arange(frames), "c2w": np.arange(frames)}
+
+    monkeypatch.setattr(adaptation, "sample_sequence", sequence)
+    learnt, kept = adaptation.one_scene(TINY)
+    assert len(learnt["rgb"]) == len(kept["rgb"]) == adaptation.FRAMES >= adaptation.WINDOW
+    for name in learnt:
+        np.testing.assert_array_equal(kept[name], learnt[name] + 1)
+
+
+@pytest.mark.slow
+def test_an_adaptation_is_scored_here_and_elsewhere():
+    params = model.init(jax.random.key(0), PLAIN)
+    head = params["dit"]["head"]["linear"]  # zero at first: nothing that LoRA changes would show
+    head["kernel"] = 0.1 * jax.random.normal(jax.random.key(1), head["kernel"].shape)
+    row = adaptation.adapt(params, PLAIN, 3, rank=4, ranks=(2,), windows=2)
+    assert list(row["losses"]) == ["before", "0", "2", "4"]
+    assert list(row["elsewhere"]) == ["before", "4"]
+    flow = {name: np.array(loss["flow"]) for name, loss in row["losses"].items()}
+    assert all(f.shape == (2,) for f in flow.values())
+    assert all(np.all(flow[n] != flow["4"]) for n in ("before", "0", "2"))
+    assert report.tables({"adaptation": row})

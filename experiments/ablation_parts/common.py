@@ -1,15 +1,18 @@
-"""Held-out samples and the clock of the ablation."""
+"""Held-out samples, the cost of an optimiser and the clock of the ablation."""
 
 import dataclasses
 import functools
+import math
 import time
 
 import jax
 import numpy as np
 
 from roge_jax.config import RoGeConfig
+from roge_jax.core.params import Tree, flatten
 from roge_jax.data.procedural import HELDOUT_SEED, sample_sequence
 from roge_jax.training import stages
+from roge_jax.training.optim import muon_dimensions
 
 SIGMAS = (0.2, 0.4, 0.6, 0.8, 0.95, 1.0)
 CONTEXTS, SCENES = 3, 32  # photos of a sample; held-out scenes for reconstruction
@@ -28,6 +31,18 @@ def heldout(stage: stages.Stage, config: RoGeConfig, scenes: int) -> list[dict[s
     fixed = dataclasses.replace(stage, views=views, batch=1)
     sequences = heldout_sequences(scenes, config.height, config.width)
     return [stages.stage_batch([s], fixed, config, 0, i) for i, s in enumerate(sequences)]
+
+
+def muon_flops(specs: Tree) -> float:
+    """Of Muon's five Newton-Schulz iterations on all matrices of a step."""
+    flat, total = flatten(specs), 0.0
+    for path, rule in flatten(muon_dimensions(specs)).items():
+        if rule is not None:
+            *ins, d_out = (n for n, a in zip(flat[path].shape, flat[path].axes) if a != "layers")
+            small, large = sorted((math.prod(ins), d_out))
+            layers = math.prod(flat[path].shape) // (small * large)
+            total += 5 * layers * (4.0 * small**2 * large + 2.0 * small**3)
+    return total
 
 
 class Clock:

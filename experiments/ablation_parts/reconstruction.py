@@ -1,7 +1,6 @@
 """Variants of the reconstruction branch, each trained from nothing for the same FLOPs."""
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,9 +16,9 @@ from roge_jax.data.views import ViewConfig
 from roge_jax.recon.picture import decode_all
 from roge_jax.recon.vggt import encoder_grid
 from roge_jax.training import loop, stages
-from roge_jax.training.optim import make_optimiser, muon_dimensions
+from roge_jax.training.optim import make_optimiser
 
-from .common import CONTEXTS, SCENES, Clock, heldout
+from .common import CONTEXTS, SCENES, Clock, heldout, muon_flops
 
 PHOTOS = (1, 2, 3, 4, 6)
 
@@ -102,16 +101,7 @@ def step_flops(variant: Variant, config: RoGeConfig) -> float:
     forward += cost.renderer(r, *size, seen, CONTEXTS, stage.views.targets)
     update = 0.0
     if stage.optim.name == "muon":
-        specs, _ = model.split(model.specs(config), stage.trains)
-        flat = flatten(specs)
-        for path, rule in flatten(muon_dimensions(specs)).items():
-            if rule is not None:
-                *ins, d_out = (
-                    n for n, a in zip(flat[path].shape, flat[path].axes) if a != "layers"
-                )
-                small, large = sorted((math.prod(ins), d_out))
-                layers = math.prod(flat[path].shape) // (small * large)
-                update += 5 * layers * (4.0 * small**2 * large + 2.0 * small**3)
+        update = muon_flops(model.split(model.specs(config), stage.trains)[0])
     return 4.0 * stage.batch * forward + update
 
 

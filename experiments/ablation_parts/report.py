@@ -6,22 +6,35 @@ import numpy as np
 
 from roge_jax.metrics.report import bootstrap
 
+from . import reconstruction, transformer
 from .common import SIGMAS
-from .reconstruction import VARIANTS
+
+ORDER = (
+    *reconstruction.VARIANTS,
+    *("look-up", "conditions", "finetune"),
+    *transformer.VARIANTS,
+    *("lora", "adaptation", "adaptation, rank 8", "adaptation, rank 2"),
+)
+
+WHERE = {"lora": "training scenes", "adaptation": "one scene"}  # what LoRA was trained on
+
+
+def scores(row: dict) -> np.ndarray:
+    """One number per held-out scene, higher is better: PSNR, or the flow error over all noise levels, negated."""
+    return np.asarray(row["psnr"]) if "psnr" in row else -np.mean(row["errors"], 1)
 
 
 def difference(rows: dict[str, dict], name: str) -> dict[str, float]:
-    """Paired difference in dB of a variant to its reference, over the held-out scenes.
+    """Paired difference of the scores of a variant to its reference, over the held-out scenes.
 
-    The reference is the mean over all seeds of the base where it is the base; a second seed of the base is compared
-    with the first alone, which shows what a seed is worth.
+    Where the reference is the base it is the mean over all its seeds; a second seed of the base is compared with the
+    first alone, which shows what a seed is worth.
     """
     row = rows[name]
-    base = [r["psnr"] for r in rows.values() if r["question"] == "seed"]
-    reference = rows[row["reference"]]["psnr"] if row["reference"] != "base" else np.mean(base, 0)
-    if row["question"] == "seed":
-        reference = rows["base"]["psnr"]
-    return bootstrap(np.asarray(row["psnr"]) - np.asarray(reference))
+    reference = scores(rows[row["reference"]])
+    if row["question"] != "seed" and rows[row["reference"]]["question"] == "seed":
+        reference = np.mean([scores(r) for r in rows.values() if r["question"] == "seed"], 0)
+    return bootstrap(scores(row) - reference)
 
 
 def verdict(d: dict[str, float], noise: float) -> str:
@@ -31,106 +44,179 @@ def verdict(d: dict[str, float], noise: float) -> str:
     return "better" if d["mean"] > 0 else "worse"
 
 
-def seed_noise(recon: dict[str, dict]) -> float:
-    seeds = [n for n, r in recon.items() if r["question"] == "seed" and n != "base"]
-    return max((abs(difference(recon, n)["mean"]) for n in seeds), default=0.0)
+def seed_noise(rows: dict[str, dict]) -> float:
+    seeds = [n for n, r in rows.items() if r["question"] == "seed" and n != r["reference"]]
+    return max((abs(difference(rows, n)["mean"]) for n in seeds), default=0.0)
 
 
-def ready(recon: dict[str, dict]) -> dict[str, dict]:
-    """The rows whose reference is there."""
-    return {n: r for n, r in recon.items() if r["reference"] in recon and "base" in recon}
+def ready(rows: dict[str, dict], group: str = "reconstruction") -> dict[str, dict]:
+    """The rows of a group of variants whose reference is there."""
+    rows = {n: r for n, r in rows.items() if r["group"] == group}
+    return {n: r for n, r in rows.items() if r["reference"] in rows}
+
+
+def judged(rows: dict[str, dict], name: str) -> str:
+    """The verdict on one of the `ready` rows."""
+    if rows[name]["question"] == "seed":
+        return "(reference)"
+    return verdict(difference(rows, name), seed_noise(rows))
+
+
+def _interval(d: dict[str, float], digits: int) -> str:
+    return f"{d['mean']:+.{digits}f} [{d['low']:+.{digits}f}, {d['high']:+.{digits}f}]"
+
+
+def _early(rows: dict[str, dict], name: str) -> float:
+    """Difference to the reference halfway, by its mean over the seeds if it has several."""
+    reference = rows[rows[name]["reference"]]
+    same = [reference]
+    if reference["question"] == "seed":
+        same = [r for r in rows.values() if r["question"] == "seed"]
+    return rows[name]["halfway"] - float(np.mean([r["halfway"] for r in same]))
+
+
+def _variants_table(rows: dict[str, dict]) -> list[str]:
+    lines = [
+        "| variant | parameters (M) | steps | core-s | PSNR | difference (dB) [95 %] | halfway | verdict |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    recon = ready(rows)
+    for name, row in recon.items():
+        versus = "" if row["reference"] == "base" else f", against {row['reference']}"
+        shown = _interval(difference(recon, name), 2) + versus
+        lines.append(
+            f"| {name} | {row['parameters'] / 1e6:.2f} | {row['steps']} | {row['core_seconds']:.0f} | "
+            f"{np.mean(row['psnr']):.2f} | {shown if name != 'base' else ''} | "
+            f"{_early(recon, name):+.2f} | {judged(recon, name)} |"
+        )
+    return lines
+
+
+def _look_up_table(row: dict) -> list[str]:
+    lines = ["| photos | " + " | ".join(row["parts"]) + " | both over RGB head [95 %] |"]
+    lines += ["|---" * (len(row["parts"]) + 2) + "|"]
+    for m, each in row["psnr"].items():
+        cells = " | ".join(f"{np.mean(x):.2f}" for x in each)
+        gain = bootstrap(np.subtract(each[-1], each[0]))
+        lines.append(f"| {m} | {cells} | {_interval(gain, 2)} |")
+    return lines
+
+
+def _conditions_table(row: dict) -> list[str]:
+    found = {n: np.asarray(e) for n, e in row["errors"].items()}
+    whole = found["all conditions"]
+    lines = ["| condition | " + " | ".join(f"{s:g}" for s in SIGMAS) + " | mean rise [95 %] |"]
+    lines += ["|---" * (len(SIGMAS) + 2) + "|"]
+    for name, e in found.items():
+        rise = _interval(bootstrap((e - whole).mean(1)), 3)
+        cells = " | ".join(f"{x:.3f}" for x in e.mean(0))
+        lines.append(f"| {name} | {cells} | {rise if name != 'all conditions' else ''} |")
+    itself = row.get("preview_itself")
+    if itself:  # at sigma 1 a flow error is that of a guess of x0
+        lines += ["", f"The preview's own latents, taken for x0: {np.mean(itself):.3f}."]
+    return lines
+
+
+def _finetune_table(row: dict) -> list[str]:
+    whole = np.asarray(row["after"]["all conditions"])
+    lines = ["| trained on | flow error before | after | after, against all [95 %] | core-s |"]
+    lines += ["|---|---|---|---|---|"]
+    for name in row["after"]:
+        before, after = (np.asarray(row[k][name]) for k in ("before", "after"))
+        more = _interval(bootstrap((after - whole).mean(1)), 3)
+        lines.append(
+            f"| {name} | {before.mean():.3f} | {after.mean():.3f} | "
+            f"{more if name != 'all conditions' else ''} | {row['clocks'][name]['core_seconds']:.0f} |"
+        )
+    return lines
+
+
+def _transformer_table(rows: dict[str, dict]) -> list[str]:
+    """Differences are of errors, so below zero is better; `scores` has them the other way."""
+    lines = [
+        "| variant | parameters (M) | steps | core-s | flow error | difference [95 %] | halfway | verdict |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        d = difference(rows, name)
+        d = {"mean": -d["mean"], "low": -d["high"], "high": -d["low"]}
+        shown = _interval(d, 4) if name != row["reference"] else ""
+        lines.append(
+            f"| {name} | {row['parameters'] / 1e6:.2f} | {row['steps']} | {row['core_seconds']:.0f} | "
+            f"{np.mean(row['errors']):.4f} | {shown} | {_early(rows, name):+.4f} | {judged(rows, name)} |"
+        )
+    untrained = next(iter(rows.values()))["untrained"]
+    return [
+        *lines,
+        "",
+        f"Flow error of the preview alone, before any step: {np.mean(untrained):.4f}.",
+    ]
+
+
+def _spectrum_table(row: dict) -> list[str]:
+    lines = ["| layers | matrices | stable rank | rank of 90 % | of 99 % of the energy |"]
+    lines += ["|---|---|---|---|---|"]
+    for family, s in row["spectrum"].items():
+        lines.append(
+            f"| {family} | {s['matrices']} | {s['stable_rank']:.1f} | {s['rank_90']:.1f} | {s['rank_99']:.1f} |"
+        )
+    return lines
+
+
+def _ranks_table(row: dict, outright: dict[str, dict]) -> list[str]:
+    """`outright`: rows of runs at lower ranks."""
+    lines = ["| rank kept | flow error | change to the full update [95 %] | RGB head, MSE x 1000 |"]
+    lines += ["|---|---|---|---|"]
+    whole = str(row["rank"])
+    labels = {"before": "untrained", "0": "0 (E1 and new embeddings alone)"}
+    found = {labels.get(name, name): loss for name, loss in row["losses"].items()}
+    for other in outright.values():
+        label = f"{other['rank']}, trained at {other['rank']}"
+        found[label] = other["losses"][str(other["rank"])]
+    for label, loss in found.items():
+        apart = np.subtract(loss["flow"], row["losses"][whole]["flow"])
+        change = _interval(bootstrap(apart), 4)
+        lines.append(
+            f"| {label} | {np.mean(loss['flow']):.4f} | {change if label != whole else ''} | "
+            f"{1000 * np.mean(loss['photometric']):.3f} |"
+        )
+    if "elsewhere" in row:
+        before, after = (row["elsewhere"][name]["flow"] for name in ("before", whole))
+        change = _interval(bootstrap(np.subtract(after, before)), 4)
+        told = f"flow error {np.mean(before):.4f} before, {np.mean(after):.4f} after, {change}"
+        lines += ["", f"On {len(before)} other scenes, the same update: {told}."]
+    return lines
+
+
+def lower_ranks(rows: dict[str, dict]) -> dict[str, dict]:
+    """The adaptations that were trained at a lower rank than the one that is cut."""
+    return {n: r for n, r in rows.items() if r["group"] == "adaptation" and n != "adaptation"}
 
 
 def tables(rows: dict[str, dict]) -> str:
     """The results as markdown."""
-    recon = {n: r for n, r in rows.items() if r["group"] == "reconstruction"}
-    noise, lines = seed_noise(recon), []
-    lines += [
-        "| variant | parameters (M) | steps | core-s | PSNR | difference (dB) [95 %] | halfway | verdict |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for name, row in ready(recon).items():
-        d = difference(recon, name)
-        base = np.mean([r["halfway"] for r in recon.values() if r["question"] == "seed"])
-        if row["reference"] != "base":
-            base = recon[row["reference"]]["halfway"]
-        early = row["halfway"] - base
-        word = "(reference)" if row["question"] == "seed" else verdict(d, noise)
-        versus = "" if row["reference"] == "base" else f", against {row['reference']}"
-        shown = f"{d['mean']:+.2f} [{d['low']:+.2f}, {d['high']:+.2f}]{versus}"
-        lines.append(
-            f"| {name} | {row['parameters'] / 1e6:.2f} | {row['steps']} | {row['core_seconds']:.0f} | "
-            f"{np.mean(row['psnr']):.2f} | {shown if name != 'base' else ''} | {early:+.2f} | {word} |"
-        )
-    if "look-up" in rows:
-        row = rows["look-up"]
-        lines += ["", "| photos | " + " | ".join(row["parts"]) + " | both over RGB head [95 %] |"]
-        lines += ["|---" * (len(row["parts"]) + 2) + "|"]
-        for m, each in row["psnr"].items():
-            d = bootstrap(np.subtract(each[-1], each[0]))
-            cells = " | ".join(f"{np.mean(x):.2f}" for x in each)
-            lines.append(
-                f"| {m} | {cells} | {d['mean']:+.2f} [{d['low']:+.2f}, {d['high']:+.2f}] |"
-            )
-    if "conditions" in rows:
-        found = {n: np.asarray(e) for n, e in rows["conditions"]["errors"].items()}
-        whole = found["all conditions"]
-        lines += [
-            "",
-            "| condition | " + " | ".join(f"{s:g}" for s in SIGMAS) + " | mean rise [95 %] |",
-        ]
-        lines += ["|---" * (len(SIGMAS) + 2) + "|"]
-        for name, e in found.items():
-            d = bootstrap((e - whole).mean(1))
-            rise = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
-            cells = " | ".join(f"{x:.3f}" for x in e.mean(0))
-            lines.append(f"| {name} | {cells} | {rise if name != 'all conditions' else ''} |")
-        itself = rows["conditions"].get("preview_itself")
-        if itself:  # at sigma 1 a flow error is that of a guess of x0
-            lines += ["", f"The preview's own latents, taken for x0: {np.mean(itself):.3f}."]
-    if "finetune" in rows:
-        row = rows["finetune"]
-        whole = np.asarray(row["after"]["all conditions"])
-        lines += [
-            "",
-            "| trained on | flow error before | after | after, against all [95 %] | core-s |",
-        ]
-        lines += ["|---|---|---|---|---|"]
-        for name in row["after"]:
-            before, after = (np.asarray(row[k][name]) for k in ("before", "after"))
-            d = bootstrap((after - whole).mean(1))
-            more = f"{d['mean']:+.3f} [{d['low']:+.3f}, {d['high']:+.3f}]"
-            lines.append(
-                f"| {name} | {before.mean():.3f} | {after.mean():.3f} | "
-                f"{more if name != 'all conditions' else ''} | {row['clocks'][name]['core_seconds']:.0f} |"
-            )
-    if "lora" in rows:
-        row = rows["lora"]
-        lines += ["", f"LoRA, {row['steps']} steps, {len(row['losses']['0']['flow'])} scenes:"]
-        lines += ["", "| layers | matrices | stable rank | rank of 90 % | of 99 % of the energy |"]
-        lines += ["|---|---|---|---|---|"]
-        for family, s in row["spectrum"].items():
-            lines.append(
-                f"| {family} | {s['matrices']} | {s['stable_rank']:.1f} | {s['rank_90']:.1f} | {s['rank_99']:.1f} |"
-            )
-        lines += [
-            "",
-            "| rank kept | flow error | change to the full update [95 %] | RGB head, MSE x 1000 |",
-        ]
-        lines += ["|---|---|---|---|"]
-        last = np.asarray(row["losses"][str(row["rank"])]["flow"])
-        for name, loss in row["losses"].items():
-            d = bootstrap(np.asarray(loss["flow"]) - last)
-            change = f"{d['mean']:+.4f} [{d['low']:+.4f}, {d['high']:+.4f}]"
-            label = {"before": "untrained", "0": "0 (E1 and new embeddings alone)"}.get(name, name)
-            lines.append(
-                f"| {label} | {np.mean(loss['flow']):.4f} | {change if name != str(row['rank']) else ''} | "
-                f"{1000 * np.mean(loss['photometric']):.3f} |"
-            )
-    missing = [n for n in (*VARIANTS, "look-up", "conditions", "finetune", "lora") if n not in rows]
+    parts = [_variants_table(rows)]
+    for name, table in (
+        ("look-up", _look_up_table),
+        ("conditions", _conditions_table),
+        ("finetune", _finetune_table),
+    ):
+        if name in rows:
+            parts.append(table(rows[name]))
+    transformers = ready(rows, "transformer")
+    if transformers:
+        parts.append(_transformer_table(transformers))
+    for name, where in WHERE.items():
+        if name in rows:
+            row = rows[name]
+            count = len(row["losses"]["0"]["flow"])
+            parts.append([f"LoRA on {where}, {row['steps']} steps, {count} held-out samples:"])
+            parts.append(_spectrum_table(row))
+            parts.append(_ranks_table(row, lower_ranks(rows) if name == "adaptation" else {}))
+    missing = [n for n in ORDER if n not in rows]
     if missing:
-        lines += ["", f"Not run yet: {', '.join(missing)}."]
-    return "\n".join(lines)
+        parts.append([f"Not run yet: {', '.join(missing)}."])
+    return "\n\n".join("\n".join(lines) for lines in parts)
 
 
 def write_tables(rows: dict[str, dict], doc: Path) -> None:
@@ -151,53 +237,72 @@ def draw(rows: dict[str, dict], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    fig = plt.figure(figsize=(16.5, 9.5))
+    fig = plt.figure(figsize=(16.5, 14))
     outer = fig.add_gridspec(
-        1, 2, width_ratios=[1, 1.45], left=0.165, right=0.985, top=0.95, bottom=0.075, wspace=0.17
+        1, 2, width_ratios=[1, 1.45], left=0.165, right=0.985, top=0.965, bottom=0.05, wspace=0.17
     )
-    _variants(fig.add_subplot(outer[0]), rows)
-    right = outer[1].subgridspec(2, 2, hspace=0.27, wspace=0.3)
-    panels = {"conditions": _conditions, "finetune": _finetune, "lora": _spectrum}
-    cells = (right[0, 0], right[0, 1], right[1, 0])
-    for (name, panel), cell in zip(panels.items(), cells):
+    recon, trained = ready(rows), ready(rows, "transformer")
+    heights = [max(len(recon), 2), max(len(trained), 2)]
+    left = outer[0].subgridspec(2, 1, height_ratios=heights, hspace=0.16)
+    if recon:
+        ax = fig.add_subplot(left[0])
+        _variants(ax, recon, 1.0, "dB")
+        ax.set_xlabel(
+            "held-out PSNR above that of the base (dB), mean and 95 % interval over scenes"
+        )
+        ax.set_title(
+            _budget(recon["base"]) + f", {np.mean(recon['base']['psnr']):.2f} dB", fontsize=10
+        )
+    if trained:
+        ax, base = fig.add_subplot(left[1]), trained["transformer"]
+        _variants(ax, trained, 100 / np.mean(base["errors"]), "%")
+        ax.set_xlabel("held-out flow error below that of the base (%), mean and 95 % interval")
+        title = f"transformer: {_budget(base)}, error {np.mean(base['errors']):.4f}"
+        ax.set_title(title, fontsize=10)
+    right = outer[1].subgridspec(3, 2, hspace=0.27, wspace=0.3)
+    panels = (
+        ("conditions", _conditions, right[0, 0]),
+        ("finetune", _finetune, right[0, 1]),
+        ("lora", _spectrum, right[1, 0]),
+        ("adaptation", _spectrum, right[2, 0]),
+    )
+    for name, panel, cell in panels:
         if name in rows:
             panel(fig.add_subplot(cell), rows[name])
     if "lora" in rows:
-        _ranks(fig.add_subplot(right[1, 1]), rows["lora"])
+        _ranks(fig.add_subplot(right[1, 1]), rows["lora"], {})
+    if "adaptation" in rows:
+        _ranks(fig.add_subplot(right[2, 1]), rows["adaptation"], lower_ranks(rows))
     fig.savefig(path, dpi=80)
     plt.close(fig)
 
 
-def _variants(ax, rows: dict[str, dict]) -> None:
-    recon = ready({n: r for n, r in rows.items() if r["group"] == "reconstruction"})
-    noise = seed_noise(recon)
-    names = [n for n in recon if n != "base"][::-1]
-    if not names:
-        return
-    ax.axvspan(-noise, noise, color="0.9", zorder=0, label=f"seed of the base: {noise:.2f} dB")
+def _budget(base: dict) -> str:
+    return f"{base['tera_flop']:.1f} TFLOP each; base: {base['steps']} steps, n = {len(scores(base))} scenes"
+
+
+def _variants(ax, rows: dict[str, dict], unit: float, word: str) -> None:
+    """Differences of the `scores` times `unit`, with the seeds' difference as a band."""
+    noise = unit * seed_noise(rows)
+    names = [n for n, r in rows.items() if n != r["reference"]][::-1]
+    ax.axvspan(-noise, noise, color="0.9", zorder=0, label=f"seed of the base: {noise:.2g} {word}")
     ax.axvline(0, color="k", lw=0.8)
-    for y, name in enumerate(names):
-        d, row = difference(recon, name), recon[name]
-        word = "(reference)" if row["question"] == "seed" else verdict(d, noise)
-        bar = [[d["mean"] - d["low"]], [d["high"] - d["mean"]]]
-        ax.errorbar(d["mean"], y, xerr=bar, fmt="o", color=COLOURS[word], capsize=3, ms=6)
-    for word, colour in COLOURS.items():
-        ax.plot([], [], "o", color=colour, label=word.strip("()"))
     labels = []
-    for name in names:
-        versus = recon[name]["reference"]
-        more = "" if versus == "base" else f"\nagainst {versus}"
-        labels.append(f"{name} ({recon[name]['steps']} steps){more}")
+    for y, name in enumerate(names):
+        mean, low, high = (unit * difference(rows, name)[key] for key in ("mean", "low", "high"))
+        colour = COLOURS[judged(rows, name)]
+        ax.errorbar(
+            mean, y, xerr=[[mean - low], [high - mean]], fmt="o", color=colour, capsize=3, ms=6
+        )
+        versus = rows[name]["reference"]
+        more = "" if rows[versus]["question"] == "seed" else f"\nagainst {versus}"
+        labels.append(f"{name} ({rows[name]['steps']} steps){more}")
+    for verdict_, colour in COLOURS.items():
+        ax.plot([], [], "o", color=colour, label=verdict_.strip("()"))
     ax.set_yticks(range(len(names)), labels, fontsize=9)
-    ax.set_xlabel("held-out PSNR less that of the base (dB), mean and 95 % interval over scenes")
-    base = recon["base"]
-    ax.set_title(
-        f"{base['tera_flop']:.1f} TFLOP each; base: {base['steps']} steps, {np.mean(base['psnr']):.2f} dB, "
-        f"n = {len(base['psnr'])} scenes",
-        fontsize=10,
-    )
+    ax.set_ylim(-0.7, len(names) + 0.4)  # room for the legend
     ax.grid(True, axis="x", alpha=0.3)
-    ax.legend(fontsize=8, loc="best")
+    ax.legend(fontsize=7, ncols=3, loc="upper center", columnspacing=0.8)
 
 
 def _conditions(ax, row: dict) -> None:
@@ -241,27 +346,35 @@ def _spectrum(ax, row: dict) -> None:
             ax.plot(range(1, 1 + len(s["relative"])), s["relative"], "o-", ms=3, label=family)
     ax.set(xscale="log", yscale="log", xlabel="singular value", ylabel="size over the largest")
     ax.set_ylim(bottom=1e-3)
-    ax.set_title(f"LoRA update of rank {row['rank']}, mean of the layers", fontsize=10)
+    ax.set_title(
+        f"LoRA update of rank {row['rank']}, mean of the layers; {WHERE[row['group']]}", fontsize=10
+    )
     ax.set_xticks([1, 2, 4, 8, 16, 32], ["1", "2", "4", "8", "16", "32"])
     ax.minorticks_off()
     ax.grid(True, alpha=0.3)
     ax.legend(fontsize=7)
 
 
-def _ranks(ax, row: dict) -> None:
+def _ranks(ax, row: dict, outright: dict[str, dict]) -> None:
     last = {k: np.asarray(v) for k, v in row["losses"][str(row["rank"])].items()}
+    names = list(row["losses"])
     for k, (term, label) in enumerate((("flow", "flow error"), ("photometric", "RGB head, MSE"))):
-        gaps = []
-        for loss in row["losses"].values():
-            d = np.asarray(loss[term]) / last[term]
-            gaps.append(bootstrap(100 * (d - 1)))
-        mean, low, high = (np.array([g[key] for g in gaps]) for key in ("mean", "low", "high"))
-        ax.errorbar(range(len(gaps)), mean, [mean - low, high - mean], fmt=f"C{k}o-", ms=4,
-                    capsize=3, label=label)  # fmt: skip
+
+        def gap(losses, term=term):
+            return bootstrap(100 * (np.asarray(losses[term]) / last[term] - 1))
+
+        def bars(gaps, where, style, **words):
+            mean, low, high = (np.array([g[key] for g in gaps]) for key in ("mean", "low", "high"))
+            ax.errorbar(where, mean, [mean - low, high - mean], fmt=style, ms=4, capsize=3, **words)
+
+        bars([gap(row["losses"][n]) for n in names], range(len(names)), f"C{k}o-", label=label)
+        if outright:
+            found = [gap(r["losses"][str(r["rank"])]) for r in outright.values()]
+            where = [names.index(str(r["rank"])) + 0.2 for r in outright.values()]
+            bars(found, where, f"C{k}s", mfc="none", label=f"{label}, trained at that rank")
     ax.axhline(0, color="k", lw=0.8)
-    names = ["un-\ntrained" if n == "before" else n for n in row["losses"]]
-    ax.set_xticks(range(len(names)), names)
+    ax.set_xticks(range(len(names)), ["un-\ntrained" if n == "before" else n for n in names])
     ax.set(xlabel="rank kept", ylabel="held-out loss above the full update (%)")
-    ax.set_title("the update cut to lower rank", fontsize=10)
+    ax.set_title(f"the update cut to lower rank; {WHERE[row['group']]}", fontsize=10)
     ax.grid(True, alpha=0.3)
     ax.legend(fontsize=8)
