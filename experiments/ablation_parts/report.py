@@ -377,4 +377,6 @@ def _ranks(ax, row: dict, outright: dict[str, dict]) -> None:
     ax.set(xlabel="rank kept", ylabel="held-out loss above the full update (%)")
     ax.set_title(f"the update cut to lower rank; {WHERE[row['group']]}", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.legend(fontsize=8)
+    low, high = ax.get_ylim()
+    ax.set_ylim(low, high + 0.2 * (high - low) * (1 + bool(outright)))  # room for the legend
+    ax.legend(fontsize=7, loc="upper right")
