@@ -50,12 +50,50 @@ def measure(candidates: dict, rounds: int) -> dict:
     return summary
 
 
+def product_speed(tokens: int, width: int, ffn: int) -> dict:
+    """A linear layer's three products beside PyTorch's: XLA's own speed, which no formulation of ours changes."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    import torch
+
+    rng = np.random.default_rng(0)
+    result = {}
+    for d_in, d_out in ((width, width), (width, ffn), (ffn, width)):
+        x, w, g = (
+            rng.standard_normal(shape, np.float32)
+            for shape in ((tokens, d_in), (d_in, d_out), (tokens, d_out))
+        )
+        tx, tw, tg = torch.from_numpy(x), torch.from_numpy(w.T.copy()), torch.from_numpy(g)
+        products = {
+            "output": (lambda: tx @ tw.T, lambda x, w, g: x @ w),
+            "gradient of the input": (lambda: tg @ tw, lambda x, w, g: g @ w.T),
+            "gradient of the kernel": (lambda: tg.T @ tx, lambda x, w, g: x.T @ g),
+        }
+        arrays = [jnp.asarray(a) for a in (x, w, g)]
+        for name, (theirs, ours) in products.items():
+            print(f"product, {tokens} tokens, {d_in} to {d_out}: {name}")
+            run = jax.jit(ours)
+            candidates = {
+                "torch": theirs,
+                "XLA": lambda run=run: jax.block_until_ready(run(*arrays)),
+            }
+            result[f"{d_in} to {d_out}, {name}"] = measure(candidates, 2 * ROUNDS)
+    return result
+
+
 def attention_variants():
-    """Three formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
+    """Four formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
+    import math
+
     import jax
     import jax.numpy as jnp
 
-    from roge_jax.core.attention import attention
+    from roge_jax.core.attention import attention, scores_limit
+
+    def together(q, k, v):
+        with scores_limit(math.inf):
+            return attention(q, k, v)
 
     def naive(q, k, v):
         s = jnp.einsum("qhe,she->hqs", q, k) * q.shape[-1] ** -0.5
@@ -64,7 +102,12 @@ def attention_variants():
     def library(q, k, v):
         return jax.nn.dot_product_attention(q[None], k[None], v[None])[0]
 
-    return {"late normalised (ours)": attention, "dot_product_attention": library, "naive": naive}
+    return {
+        "head by head (ours)": attention,
+        "all heads at once": together,
+        "softmax first": naive,
+        "dot_product_attention": library,
+    }
 
 
 def attention_speed(tokens: int, heads: int, head_dim: int) -> dict:
@@ -202,6 +245,7 @@ def main() -> None:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     import dataclasses
+    import math
 
     import diffusers
     import jax
@@ -214,6 +258,7 @@ def main() -> None:
         width=384, heads=6, depth=4, ffn=1536, in_channels=16, text_dim=64, text_len=512, clip_dim=0
     )
     grid = {"slots": 8, "rows": 9, "columns": 14}
+    tokens = math.prod(grid.values())
     result = {
         "settings": {
             "transformer": dataclasses.asdict(cfg),
@@ -232,7 +277,8 @@ def main() -> None:
         "device": cpu_name(),
         "commit": commit(),
         "transformer": transformer_speed(cfg, **grid),
-        "attention": attention_speed(1008, cfg.heads, cfg.width // cfg.heads),
+        "attention": attention_speed(tokens, cfg.heads, cfg.width // cfg.heads),
+        "products": product_speed(tokens, cfg.width, cfg.ffn),
     }
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -24,8 +24,9 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
 
     `dtype` is that of the matrix products' inputs; with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
     no memory for the l x s scores. Elsewhere scores above a limit are not stored: queries are taken in pieces, and
-    the gradient computes their scores once more. The limit is `SCORES_BYTES`; on a lone CPU it is `CACHE_BYTES`, and
-    every head of every sequence comes by itself: fresh memory for all scores takes longer there than the products.
+    the gradient computes their scores once more. The limit is `SCORES_BYTES`; on a lone CPU it is `CACHE_BYTES` where
+    a head has much of that, and every head of every sequence comes by itself: fresh memory for the scores of all
+    takes longer there than the products. Heads with few scores share the work of several cores better together.
     """
     scale = q.shape[-1] ** -0.5
     if jax.default_backend() == "gpu" and dtype == jnp.bfloat16:
@@ -35,7 +36,8 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
         return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
     q, k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (q * scale, k, v))
     lone_cpu = jax.default_backend() == "cpu" and current() is None
-    limit = _LIMIT.get() or (CACHE_BYTES if lone_cpu else SCORES_BYTES)
+    large = lone_cpu and 4.0 * q.shape[-2] * k.shape[-2] > CACHE_BYTES / 8
+    limit = _LIMIT.get() or (CACHE_BYTES if large else SCORES_BYTES)
     if _scores_bytes(q, k) <= limit:
         y, _ = _weighted_sum(q, k, v)
     elif lone_cpu:
