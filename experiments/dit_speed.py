@@ -9,6 +9,7 @@ rounds, the quartiles, and the median over rounds of the ratio within a round. T
 Writes experiments/results/dit_speed.json.
 """
 
+import functools
 import json
 import os
 import platform
@@ -57,28 +58,27 @@ def product_speed(tokens: int, width: int, ffn: int) -> dict:
     import numpy as np
     import torch
 
+    # PyTorch keeps a kernel as [out, in], JAX as [in, out].
+    products = {
+        "output": (lambda x, w, g: x @ w.T, lambda x, w, g: x @ w),
+        "gradient of the input": (lambda x, w, g: g @ w, lambda x, w, g: g @ w.T),
+        "gradient of the kernel": (lambda x, w, g: g.T @ x, lambda x, w, g: x.T @ g),
+    }
     rng = np.random.default_rng(0)
     result = {}
     for d_in, d_out in ((width, width), (width, ffn), (ffn, width)):
-        x, w, g = (
-            rng.standard_normal(shape, np.float32)
-            for shape in ((tokens, d_in), (d_in, d_out), (tokens, d_out))
-        )
-        tx, tw, tg = torch.from_numpy(x), torch.from_numpy(w.T.copy()), torch.from_numpy(g)
-        products = {
-            "output": (lambda: tx @ tw.T, lambda x, w, g: x @ w),
-            "gradient of the input": (lambda: tg @ tw, lambda x, w, g: g @ w.T),
-            "gradient of the kernel": (lambda: tg.T @ tx, lambda x, w, g: x.T @ g),
-        }
-        arrays = [jnp.asarray(a) for a in (x, w, g)]
+        shapes = (tokens, d_in), (d_in, d_out), (tokens, d_out)
+        x, w, g = (rng.standard_normal(shape, np.float32) for shape in shapes)
+        tensors = [torch.from_numpy(a) for a in (x, w.T.copy(), g)]
         for name, (theirs, ours) in products.items():
-            print(f"product, {tokens} tokens, {d_in} to {d_out}: {name}")
-            run = jax.jit(ours)
+            run = jax.jit(ours).lower(x, w, g).compile()
+            arrays = [jnp.asarray(a) for a in (x, w, g)]
             candidates = {
-                "torch": theirs,
-                "XLA": lambda run=run: jax.block_until_ready(run(*arrays)),
+                "torch": functools.partial(theirs, *tensors),
+                "XLA": lambda run=run, arrays=arrays: jax.block_until_ready(run(*arrays)),
             }
-            result[f"{d_in} to {d_out}, {name}"] = measure(candidates, 2 * ROUNDS)
+            print(f"product, {tokens} tokens, {d_in} to {d_out}: {name}")
+            result[f"{d_in} to {d_out}, {name}"] = measure(candidates, 3 * ROUNDS)
     return result
 
 
