@@ -1,6 +1,6 @@
 """Speed of the diffusion transformer on one CPU core, against PyTorch, and of the choices inside it.
 
-    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about five minutes)
+    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about six minutes)
 
 One process, one thread each, float32, the same weights in both: our `dit` and diffusers' `WanTransformer3DModel`, both
 checked to give the same velocity first. Candidates take turns within a round, so drifts of a shared machine hit all of
@@ -11,6 +11,7 @@ Writes experiments/results/dit_speed.json.
 
 import functools
 import json
+import math
 import os
 import platform
 import subprocess
@@ -47,7 +48,7 @@ def measure(candidates: dict, rounds: int) -> dict:
             "ratio": round(float(ratios[1]), 3),
             "ratio_quartiles": [round(float(ratios[0]), 3), round(float(ratios[2]), 3)],
         }
-        print(f"  {name:28s} {median:8.4f} s   x{ratios[1]:.2f}", flush=True)
+        print(f"  {name:36s} {median:8.4f} s   x{ratios[1]:.2f}", flush=True)
     return summary
 
 
@@ -84,8 +85,6 @@ def product_speed(tokens: int, width: int, ffn: int) -> dict:
 
 def attention_variants():
     """Four formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
-    import math
-
     import jax
     import jax.numpy as jnp
 
@@ -173,6 +172,7 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
     import torch
 
     from roge_jax.core import params as trees
+    from roge_jax.core.attention import scores_limit
     from roge_jax.video import dit as net
 
     torch.set_num_threads(1)
@@ -193,15 +193,17 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
             params, x, timestep, angles, cfg=cfg, rows=rows, split="text_last", **options
         )
 
-    def ours(**options):
-        compiled = jax.jit(lambda p: velocity(p, **options)).lower(params).compile()
+    def ours(scores=None, **options):
+        with scores_limit(scores):
+            compiled = jax.jit(lambda p: velocity(p, **options)).lower(params).compile()
         return lambda: jax.block_until_ready(compiled(params))
 
-    def our_gradient(**options):
+    def our_gradient(name, scores=None, **options):
         start = time.process_time()
         grad = jax.grad(lambda p: jnp.sum(jnp.sin(velocity(p, **options))))
-        compiled = jax.jit(grad).lower(params).compile()
-        compile_seconds[str(options or "scan")] = round(time.process_time() - start, 2)
+        with scores_limit(scores):
+            compiled = jax.jit(grad).lower(params).compile()
+        compile_seconds[name] = round(time.process_time() - start, 2)
         return lambda: jax.block_until_ready(compiled(params))
 
     model = torch_twin(cfg, params)
@@ -222,20 +224,26 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
     assert error < 1e-5, f"the two networks differ by {error:.1e}"
     compile_seconds: dict[str, float] = {}
     print(f"transformer, {angles.shape[0]} tokens, {cfg}: forward")
+    candidates = {
+        "torch": theirs,
+        "scan": forward,
+        "scan, all heads at once": ours(scores=math.inf),
+        "unrolled": ours(unroll=cfg.depth),
+    }
     result = {
         "relative_l2_between_frameworks": error,
-        "forward": measure(
-            {"torch": theirs, "scan": forward, "unrolled": ours(unroll=cfg.depth)}, ROUNDS
-        ),
+        "forward": measure(candidates, ROUNDS),
     }
     print("transformer: forward and backward, all parameters")
-    gradients = {
-        "torch": their_gradient,
-        "scan": our_gradient(),
-        "unrolled": our_gradient(unroll=cfg.depth),
-        "scan, recompute all": our_gradient(remat="full"),
-        "scan, keep dots": our_gradient(remat="dots"),
+    variants = {
+        "scan": {},
+        "unrolled": {"unroll": cfg.depth},
+        "scan, recompute all": {"remat": "full"},
+        "scan, keep dots": {"remat": "dots"},
+        "scan, keep dots, all heads at once": {"remat": "dots", "scores": math.inf},
     }
+    gradients = {"torch": their_gradient}
+    gradients |= {name: our_gradient(name, **options) for name, options in variants.items()}
     result["forward_backward"] = measure(gradients, ROUNDS)
     return result | {"compile_seconds_forward_backward": compile_seconds}
 
@@ -245,7 +253,6 @@ def main() -> None:
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     import dataclasses
-    import math
 
     import diffusers
     import jax

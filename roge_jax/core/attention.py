@@ -127,8 +127,8 @@ def _product(axes: str, a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @contextlib.contextmanager
-def scores_limit(limit: float) -> Iterator[None]:
-    """Another limit of the bytes of scores at a time, for what is traced inside."""
+def scores_limit(limit: float | None) -> Iterator[None]:
+    """Another limit of the bytes of scores at a time, for what is traced inside; None: the device's own."""
     token = _LIMIT.set(limit)
     try:
         yield
