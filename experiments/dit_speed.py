@@ -1,6 +1,6 @@
 """Speed of the diffusion transformer on one CPU core, against PyTorch, and of the choices inside it.
 
-    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about five minutes)
+    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about six minutes)
 
 One process, one thread each, float32, the same weights in both: our `dit` and diffusers' `WanTransformer3DModel`, both
 checked to give the same velocity first. Candidates take turns within a round, so drifts of a shared machine hit all of
@@ -9,7 +9,9 @@ rounds, the quartiles, and the median over rounds of the ratio within a round. T
 Writes experiments/results/dit_speed.json.
 """
 
+import functools
 import json
+import math
 import os
 import platform
 import subprocess
@@ -46,16 +48,51 @@ def measure(candidates: dict, rounds: int) -> dict:
             "ratio": round(float(ratios[1]), 3),
             "ratio_quartiles": [round(float(ratios[0]), 3), round(float(ratios[2]), 3)],
         }
-        print(f"  {name:28s} {median:8.4f} s   x{ratios[1]:.2f}", flush=True)
+        print(f"  {name:36s} {median:8.4f} s   x{ratios[1]:.2f}", flush=True)
     return summary
 
 
+def product_speed(tokens: int, width: int, ffn: int) -> dict:
+    """A linear layer's three products beside PyTorch's: XLA's own speed, which no formulation of ours changes."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+    import torch
+
+    # PyTorch keeps a kernel as [out, in], JAX as [in, out].
+    products = {
+        "output": (lambda x, w, g: x @ w.T, lambda x, w, g: x @ w),
+        "gradient of the input": (lambda x, w, g: g @ w, lambda x, w, g: g @ w.T),
+        "gradient of the kernel": (lambda x, w, g: g.T @ x, lambda x, w, g: x.T @ g),
+    }
+    rng = np.random.default_rng(0)
+    result = {}
+    for d_in, d_out in ((width, width), (width, ffn), (ffn, width)):
+        shapes = (tokens, d_in), (d_in, d_out), (tokens, d_out)
+        x, w, g = (rng.standard_normal(shape, np.float32) for shape in shapes)
+        tensors = [torch.from_numpy(a) for a in (x, w.T.copy(), g)]
+        for name, (theirs, ours) in products.items():
+            run = jax.jit(ours).lower(x, w, g).compile()
+            arrays = [jnp.asarray(a) for a in (x, w, g)]
+            candidates = {
+                "torch": functools.partial(theirs, *tensors),
+                "XLA": lambda run=run, arrays=arrays: jax.block_until_ready(run(*arrays)),
+            }
+            print(f"product, {tokens} tokens, {d_in} to {d_out}: {name}")
+            result[f"{d_in} to {d_out}, {name}"] = measure(candidates, 3 * ROUNDS)
+    return result
+
+
 def attention_variants():
-    """Three formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
+    """Four formulations of softmax(q k^T / sqrt(e)) v for q, k, v [l, heads, e]."""
     import jax
     import jax.numpy as jnp
 
-    from roge_jax.core.attention import attention
+    from roge_jax.core.attention import attention, scores_limit
+
+    def together(q, k, v):
+        with scores_limit(math.inf):
+            return attention(q, k, v)
 
     def naive(q, k, v):
         s = jnp.einsum("qhe,she->hqs", q, k) * q.shape[-1] ** -0.5
@@ -64,7 +101,12 @@ def attention_variants():
     def library(q, k, v):
         return jax.nn.dot_product_attention(q[None], k[None], v[None])[0]
 
-    return {"late normalised (ours)": attention, "dot_product_attention": library, "naive": naive}
+    return {
+        "head by head (ours)": attention,
+        "all heads at once": together,
+        "softmax first": naive,
+        "dot_product_attention": library,
+    }
 
 
 def attention_speed(tokens: int, heads: int, head_dim: int) -> dict:
@@ -130,6 +172,7 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
     import torch
 
     from roge_jax.core import params as trees
+    from roge_jax.core.attention import scores_limit
     from roge_jax.video import dit as net
 
     torch.set_num_threads(1)
@@ -150,15 +193,17 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
             params, x, timestep, angles, cfg=cfg, rows=rows, split="text_last", **options
         )
 
-    def ours(**options):
-        compiled = jax.jit(lambda p: velocity(p, **options)).lower(params).compile()
+    def ours(scores=None, **options):
+        with scores_limit(scores):
+            compiled = jax.jit(lambda p: velocity(p, **options)).lower(params).compile()
         return lambda: jax.block_until_ready(compiled(params))
 
-    def our_gradient(**options):
+    def our_gradient(name, scores=None, **options):
         start = time.process_time()
         grad = jax.grad(lambda p: jnp.sum(jnp.sin(velocity(p, **options))))
-        compiled = jax.jit(grad).lower(params).compile()
-        compile_seconds[str(options or "scan")] = round(time.process_time() - start, 2)
+        with scores_limit(scores):
+            compiled = jax.jit(grad).lower(params).compile()
+        compile_seconds[name] = round(time.process_time() - start, 2)
         return lambda: jax.block_until_ready(compiled(params))
 
     model = torch_twin(cfg, params)
@@ -179,20 +224,26 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
     assert error < 1e-5, f"the two networks differ by {error:.1e}"
     compile_seconds: dict[str, float] = {}
     print(f"transformer, {angles.shape[0]} tokens, {cfg}: forward")
+    candidates = {
+        "torch": theirs,
+        "scan": forward,
+        "scan, all heads at once": ours(scores=math.inf),
+        "unrolled": ours(unroll=cfg.depth),
+    }
     result = {
         "relative_l2_between_frameworks": error,
-        "forward": measure(
-            {"torch": theirs, "scan": forward, "unrolled": ours(unroll=cfg.depth)}, ROUNDS
-        ),
+        "forward": measure(candidates, ROUNDS),
     }
     print("transformer: forward and backward, all parameters")
-    gradients = {
-        "torch": their_gradient,
-        "scan": our_gradient(),
-        "unrolled": our_gradient(unroll=cfg.depth),
-        "scan, recompute all": our_gradient(remat="full"),
-        "scan, keep dots": our_gradient(remat="dots"),
+    variants = {
+        "scan": {},
+        "unrolled": {"unroll": cfg.depth},
+        "scan, recompute all": {"remat": "full"},
+        "scan, keep dots": {"remat": "dots"},
+        "scan, keep dots, all heads at once": {"remat": "dots", "scores": math.inf},
     }
+    gradients = {"torch": their_gradient}
+    gradients |= {name: our_gradient(name, **options) for name, options in variants.items()}
     result["forward_backward"] = measure(gradients, ROUNDS)
     return result | {"compile_seconds_forward_backward": compile_seconds}
 
@@ -214,6 +265,7 @@ def main() -> None:
         width=384, heads=6, depth=4, ffn=1536, in_channels=16, text_dim=64, text_len=512, clip_dim=0
     )
     grid = {"slots": 8, "rows": 9, "columns": 14}
+    tokens = math.prod(grid.values())
     result = {
         "settings": {
             "transformer": dataclasses.asdict(cfg),
@@ -232,7 +284,8 @@ def main() -> None:
         "device": cpu_name(),
         "commit": commit(),
         "transformer": transformer_speed(cfg, **grid),
-        "attention": attention_speed(1008, cfg.heads, cfg.width // cfg.heads),
+        "attention": attention_speed(tokens, cfg.heads, cfg.width // cfg.heads),
+        "products": product_speed(tokens, cfg.width, cfg.ffn),
     }
     RESULT.parent.mkdir(exist_ok=True)
     RESULT.write_text(json.dumps(result, indent=1) + "\n")

@@ -10,9 +10,10 @@ from test_sampling_mesh import cameras
 from test_sharding import drawn, small
 
 from roge_jax import config, model, programs, sampling
-from roge_jax.core import program
+from roge_jax.core import program, sharding
 from roge_jax.core.attention import attention, scores_limit
 from roge_jax.core.params import abstract
+from roge_jax.video.dit import rematerialise
 
 
 class TestChain:
@@ -83,15 +84,48 @@ class TestAttention:
         for a, b in zip(pieces, grads):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6)
 
+    def test_in_pieces_it_has_both_modes_of_derivatives(self):
+        args = self.arrays(37)
+        rates = [jnp.cos(x) for x in args]
+
+        def both(q, k, v, dq, dk, dv):
+            y, rate = jax.jvp(jax.vmap(attention), (q, k, v), (dq, dk, dv))
+            _, pull = jax.vjp(jax.vmap(attention), q, k, v)
+            return y, rate, jnp.vdot(jnp.sin(y), rate), pull(jnp.sin(y))
+
+        expected = jax.jit(both)(*args, *rates)
+        with scores_limit(4 * 2 * 37 * 10):
+            found = jax.jit(lambda *a: both(*a))(*args, *rates)
+        along = sum(jnp.vdot(g, d) for g, d in zip(found[3], rates))
+        np.testing.assert_allclose(along, found[2], rtol=1e-5)
+        for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-6)
+
+    def test_under_dots_scores_are_computed_twice_and_not_kept(self):
+        q, k, v = self.arrays(37)
+        step = rematerialise(lambda x, _: (attention(x, k, v), None), "dots")
+
+        def loss(q):
+            return jnp.sum(jax.lax.scan(step, q, None, length=3)[0])
+
+        with scores_limit(4 * 2 * 37 * 10):
+            traced = program.trace(jax.grad(loss), q)
+        one = 2 * 2 * 37 * 38 * 8  # FLOPs of a product of two heads, 37 queries padded to 38
+        assert program.flops(traced)[""] == 3 * 5 * one, "two forward, one again, two backward"
+        kept = [v for v in traced.values if getattr(v, "shape", ()) and v.shape[0] == 3]
+        assert kept and all(v.size < 3 * 2 * 37**2 for v in kept)
+
     def test_memory_grows_with_the_length_not_its_square(self):
         def peak(tokens):
             one = jax.ShapeDtypeStruct((1, tokens, 2, 64), jnp.float32)
-            return program.peak(program.trace(attention, one, one, one)).bytes
+            return program.peak(program.trace(lambda *a: attention(*a), one, one, one)).bytes
 
+        assert peak(20_000) < 20_000 / 2_000 * peak(2_000) < 4 * 2 * 20_000**2 / 20, "a lone CPU"
         limit = 1e9
-        assert peak(1000) > 4 * 2 * 1000**2
-        assert peak(46_800) < 2.5 * limit < 4 * 2 * 46_800**2
-        assert peak(4 * 46_800) < 2.5 * limit
+        with sharding.use(sharding.abstract_mesh()):
+            assert peak(1000) > 4 * 2 * 1000**2
+            assert peak(46_800) < 2.5 * limit < 4 * 2 * 46_800**2
+            assert peak(4 * 46_800) < 2.5 * limit
 
 
 def test_nine_photos_81_frames_480x832_has_its_shapes():

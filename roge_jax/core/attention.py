@@ -2,6 +2,7 @@
 
 import contextlib
 import contextvars
+import functools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -10,18 +11,22 @@ import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
+from .sharding import current
+
 SCORES_BYTES = 1e9  # of scores that are stored at a time, where they are stored at all
-_LIMIT: contextvars.ContextVar[float] = contextvars.ContextVar("scores", default=SCORES_BYTES)
+CACHE_BYTES = 2.0**23  # ... on a lone CPU
+PIECES = "attention_pieces"  # name for `jax.checkpoint` of what the gradient of attention in pieces keeps
+_LIMIT: contextvars.ContextVar[float | None] = contextvars.ContextVar("scores", default=None)
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) -> jax.Array:
     """softmax(q k^T / sqrt(e)) v for q [.., l, k, e] and k, v [.., s, k, e]; no mask. Returns float32.
 
     `dtype` is that of the matrix products' inputs; with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
-    no memory for the l x s scores. Elsewhere queries are taken in pieces if the scores are above `SCORES_BYTES`:
-    memory grows with l + s, at the price of computing the scores once more for the gradient. On CPU the scale goes
-    into q, the row maximum is not differentiated (its gradient is zero) and the division comes after the product
-    with v: fewer passes over the scores.
+    no memory for the l x s scores. Elsewhere scores above a limit are not stored: queries are taken in pieces, and
+    the gradient computes their scores once more. The limit is `SCORES_BYTES`; on a lone CPU it is `CACHE_BYTES` where
+    a head has much of that, and every head of every sequence comes by itself: fresh memory for the scores of all
+    takes longer there than the products. Heads with few scores share the work of several cores better together.
     """
     scale = q.shape[-1] ** -0.5
     if jax.default_backend() == "gpu" and dtype == jnp.bfloat16:
@@ -29,28 +34,19 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
         q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
         y = _fused(q, k, v, scale)
         return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
-    q = jnp.swapaxes(q * scale, -3, -2).astype(dtype)
-    k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (k, v))
-
-    def some(q: jax.Array) -> jax.Array:
-        with jax.named_scope("scores"):
-            s = jnp.einsum("...qe,...se->...qs", q, k, preferred_element_type=jnp.float32)
-            s = jnp.exp(s - jax.lax.stop_gradient(s.max(-1, keepdims=True)))
-            y = jnp.einsum(
-                "...qs,...se->...qe", s.astype(dtype), v, preferred_element_type=jnp.float32
-            )
-            return y / s.sum(-1, keepdims=True)
-
-    *outer, length, width = q.shape
-    pieces = max(1, math.ceil(4.0 * math.prod(q.shape[:-1]) * k.shape[-2] / _LIMIT.get()))
-    if pieces == 1:
-        y = some(q)
+    q, k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (q * scale, k, v))
+    lone_cpu = jax.default_backend() == "cpu" and current() is None
+    large = lone_cpu and 4.0 * q.shape[-2] * k.shape[-2] > CACHE_BYTES / 8
+    limit = _LIMIT.get() or (CACHE_BYTES if large else SCORES_BYTES)
+    if _scores_bytes(q, k) <= limit:
+        y, _ = _weighted_sum(q, k, v)
+    elif lone_cpu:
+        # An axis of one stays: products with a batch axis are those that a policy of `jax.checkpoint` can tell apart.
+        heads = tuple(x.reshape(-1, 1, *x.shape[-2:]) for x in (q, k, v))
+        y = jax.lax.map(lambda head: _in_pieces(head[0], head[1], head[2], limit), heads)
+        y = y.reshape(*q.shape[:-1], v.shape[-1])
     else:
-        size = -(-length // pieces)
-        q = jnp.pad(q, [(0, 0)] * len(outer) + [(0, size * pieces - length), (0, 0)])
-        q = jnp.moveaxis(q.reshape(*outer, pieces, size, width), -3, 0)
-        y = jnp.moveaxis(jax.lax.map(jax.checkpoint(some), q), 0, -3)
-        y = y.reshape(*outer, pieces * size, v.shape[-1])[..., :length, :]
+        y = _in_pieces(q, k, v, limit)
     return checkpoint_name(jnp.swapaxes(y, -3, -2), "attention")
 
 
@@ -73,9 +69,66 @@ def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
     return y[:, : lengths[0]]
 
 
+def _scores_bytes(q: jax.Array, k: jax.Array) -> float:
+    return 4.0 * math.prod(q.shape[:-1]) * k.shape[-2]
+
+
+def _in_pieces(q: jax.Array, k: jax.Array, v: jax.Array, limit: float) -> jax.Array:
+    """`_recomputed` of q [.., l, e], as many queries at a time as `limit` bytes of scores allow."""
+    *outer, length, width = q.shape
+    pieces = math.ceil(_scores_bytes(q, k) / limit)
+    if pieces == 1:
+        return _recomputed(q, k, v)
+    size = -(-length // pieces)
+    q = jnp.pad(q, [(0, 0)] * len(outer) + [(0, size * pieces - length), (0, 0)])
+    q = jnp.moveaxis(q.reshape(*outer, pieces, size, width), -3, 0)
+    y = jnp.moveaxis(jax.lax.map(lambda q: _recomputed(q, k, v), q), 0, -3)
+    return y.reshape(*outer, pieces * size, v.shape[-1])[..., :length, :]
+
+
+@jax.named_scope("scores")
+def _weighted_sum(q: jax.Array, k: jax.Array, v: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """softmax(q k^T) v and the logarithm of the softmax's sums, [.., l, e] and [.., l, 1] float32.
+
+    The row maximum is not differentiated (its gradient is zero) and the division comes after the product with v:
+    fewer passes over the scores.
+    """
+    s = _product("...qe,...se->...qs", q, k)
+    top = jax.lax.stop_gradient(s.max(-1, keepdims=True))
+    s = jnp.exp(s - top)
+    total = s.sum(-1, keepdims=True)
+    return _product("...qs,...se->...qe", s, v) / total, top + jnp.log(total)
+
+
+@jax.custom_jvp
+def _recomputed(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    """softmax(q k^T) v whose gradient keeps the result and the softmax's sums, and computes the scores again."""
+    return _weighted_sum(q, k, v)[0]
+
+
+@_recomputed.defjvp
+def _recomputed_jvp(primals, tangents):
+    y, log_total = (checkpoint_name(x, PIECES) for x in _weighted_sum(*primals))
+    return y, _tangent(*primals, y, log_total, *tangents)
+
+
+@functools.partial(jax.checkpoint, prevent_cse=False)
+@jax.named_scope("scores")
+def _tangent(q, k, v, y, log_total, dq, dk, dv):
+    p = jnp.exp(_product("...qe,...se->...qs", q, k) - log_total)
+    ds = _product("...qe,...se->...qs", dq, k) + _product("...qe,...se->...qs", q, dk)
+    dp = p * ds
+    dy = _product("...qs,...se->...qe", p, dv) + _product("...qs,...se->...qe", dp, v)
+    return dy - dp.sum(-1, keepdims=True) * y
+
+
+def _product(axes: str, a: jax.Array, b: jax.Array) -> jax.Array:
+    return jnp.einsum(axes, a.astype(b.dtype), b, preferred_element_type=jnp.float32)
+
+
 @contextlib.contextmanager
-def scores_limit(limit: float) -> Iterator[None]:
-    """Another limit of the bytes of scores at a time, for what is traced inside."""
+def scores_limit(limit: float | None) -> Iterator[None]:
+    """Another limit of the bytes of scores at a time, for what is traced inside; None: the device's own."""
     token = _LIMIT.set(limit)
     try:
         yield
@@ -84,9 +137,9 @@ def scores_limit(limit: float) -> Iterator[None]:
 
 
 def is_attention(primitive, *_, **params) -> bool:
-    """A policy of `jax.checkpoint` that keeps what attention returns (of the fused kernel also its row sums)."""
+    """A policy of `jax.checkpoint` that keeps what attention returns (in pieces and of the fused kernel also row sums)."""
     if primitive.name == "name":
-        return params["name"] == "attention"
+        return params["name"] in ("attention", PIECES)
     return "dot_product_attention_fwd" in primitive.name
 
 

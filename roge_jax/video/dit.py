@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config import DiTConfig
-from ..core.attention import attention, is_attention, merge_heads, split_heads
+from ..core.attention import PIECES, attention, is_attention, merge_heads, split_heads
 from ..core.layers import (
     gelu,
     layer_norm,
@@ -241,13 +241,16 @@ def block(
 POLICIES: dict[Remat, Any] = {
     "full": None,
     "attention": is_attention,
-    "dots": jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+    "dots": jax.checkpoint_policies.save_from_both_policies(
+        jax.checkpoint_policies.dots_with_no_batch_dims_saveable,
+        jax.checkpoint_policies.save_only_these_names(PIECES),
+    ),
 }
 
 
 def rematerialise(f, remat: Remat):
     """`f` as a scan body whose backward pass recomputes everything (full), all but what attention returns
-    (attention), all but products with weights (dots), or nothing (none)."""
+    (attention), all but products with weights and attention in pieces (dots), or nothing (none)."""
     if remat == "none":
         return f
     return jax.checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
