@@ -206,12 +206,16 @@ def main() -> None:
     import rows as parts
 
     rows = parts.rows()
-    record = {"environment": device(), "rows": {name: {"status": "not measured"} for name in rows}}
+    environment = device()
+    record = {
+        "environment": environment,
+        "rows": {name: {"status": "not measured"} for name in rows},
+    }
     found = record["rows"]
     if args.out.exists():
         kept = json.loads(args.out.read_text())["rows"]
         found |= {name: x for name, x in kept.items() if name in rows}
-    here = record["environment"].get("device", {}).get("kind")
+    here = environment.get("device", {}).get("kind")
     args.out.parent.mkdir(parents=True, exist_ok=True)
 
     def limit() -> float:
@@ -232,7 +236,8 @@ def main() -> None:
             if limit() < 20:
                 print(f"{name}: no time left", flush=True)
                 break
-            result = child(name, side, args, limit())
+            # The commit at the start: the results, written after every row, are part of it.
+            result = child(name, side, args, limit()) | {"commit": environment.get("commit")}
             if side == "ours":
                 other = {} if "peer" in todo else {"peer": found[name].get("peer")}
                 found[name] = result | {k: v for k, v in other.items() if v}

@@ -109,6 +109,7 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
         "a row of the past": here,
     }
     out, called = tmp_path / "out.json", []
+    environment = {"device": {"kind": "here"}, "commit": "abc"}
 
     def child(name, side, args, limit):
         called.append((name, side))
@@ -116,7 +117,7 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
 
     monkeypatch.setattr(experiment, "child", child)
     monkeypatch.setattr(experiment, "on_gpu", lambda: False)
-    monkeypatch.setattr(experiment, "device", lambda: {"device": {"kind": "here"}})
+    monkeypatch.setattr(experiment, "device", lambda: environment)
     monkeypatch.setattr(experiment, "chart", lambda *_: None)
 
     def run(*options):
@@ -128,7 +129,7 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
 
     found = run("--only", "dit", "--resume")
     assert called == [(one, "peer"), (two, "ours"), (two, "peer"), (unrolled, "ours")]
-    assert found[one] == here | {"peer": here | {"seconds": 1.0}}
+    assert found[one] == here | {"peer": here | {"seconds": 1.0, "commit": "abc"}}
     assert found[three] == stored[three] and found[large] == there
     assert "a row of the past" not in found
     found = run("--only", "dit")

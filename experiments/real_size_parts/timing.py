@@ -52,11 +52,10 @@ def busy_clocks(call: Callable[[], Any]) -> dict[str, str]:
 
 
 def where_and_when() -> dict[str, Any]:
-    """Device, time, commit and JAX of a measurement: a file may hold rows of several commands and machines."""
+    """Device, time and JAX of a measurement: a file may hold rows of several commands and machines."""
     found = environment()
     return {
         "device": found["device"]["kind"],
         "time": found["time"],
-        "commit": found["commit"],
         "jax": found["versions"]["jax"],
     }
