@@ -69,8 +69,6 @@ def child(name: str, side: str, args: argparse.Namespace, limit: float) -> dict:
         command += ["--seconds", f"{0.4 * limit:.0f}"]
         paths = [str(HERE.parent), os.environ.get("PYTHONPATH", "")]
         settings = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in paths if p)}
-        # Neither JAX's own frames nor its note on them, which would be the last line.
-        settings["JAX_TRACEBACK_FILTERING"] = "quiet_remove_frames"
         if side == "ours":
             settings.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", "0.92")
         else:  # PyTorch needs the memory that JAX would reserve
@@ -100,7 +98,10 @@ def child(name: str, side: str, args: argparse.Namespace, limit: float) -> dict:
 
 
 def reason(said: str) -> str:
-    """Of what a process printed, the last line that names an error; the last line if none does."""
+    """Of what a process printed, the last line that names an error; the last line if none does.
+
+    JAX prints a note on the frames that it hides after the error.
+    """
     lines = [line.strip() for line in said.splitlines() if line.strip()]
     named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
     return (named or lines or [""])[-1][:300]
