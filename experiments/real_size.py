@@ -6,27 +6,31 @@
     python experiments/real_size.py --resume         what has not been measured yet
 
 Every row runs in a process of its own, first ours, then the peer (rows of the transformer): compiled ahead, two calls
-to warm up, then the median and quartiles of ten. A row that fails, runs out of memory or of time says so and leaves the
-others; the results are written after every row, so that an interrupted run keeps them. Rows not run say "not measured".
+to warm up, then the median and quartiles of ten. A row that fails, runs out of memory or of time says so, with the end
+of what it printed, and leaves the others; the results are written after every row, so that an interrupted run keeps
+them. Rows that a run does not reach keep what the file has of them; every row says its device, time and commit.
 No network, photos or video codecs are needed. Goals are for one H100 or H200; the paper states no times.
 
-Writes experiments/results/real_size.json and .png and prints a table. A full run on a GPU takes 60 to 90 minutes by
-estimate (never run on one so far), the ladder on a CPU about 10.
+Writes experiments/results/real_size.json and .png and prints a table. A full run on a GPU takes one to two hours by
+estimate (never run on one so far), the ladder on a CPU about 10 minutes.
 """
 
 import argparse
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent
 PARTS = HERE / "real_size_parts"
 sys.path[:0] = [str(PARTS), str(HERE.parent)]
 RESULT = HERE / "results" / "real_size.json"
+LOG_CHARACTERS = 2000  # kept of what a failed row printed
 GROUPS = ("dit", "train", "vggt", "rays", "render", "vae", "sample", "numerics")
 
 
@@ -38,14 +42,14 @@ def on_gpu() -> bool:
 
 
 def device() -> dict:
-    """Environment of the run, the GPU's name, driver and clocks included."""
+    """Environment of the run, the GPU's name, driver and limits included."""
     code = "import json, jax; jax.devices(); from roge_jax.entry import environment; print(json.dumps(environment()))"
     found = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=HERE.parent
     )
     record = json.loads(found.stdout.splitlines()[-1]) if found.returncode == 0 else {}
     record["command"] = [Path(sys.argv[0]).name, *sys.argv[1:]]
-    fields = "name,driver_version,clocks.max.sm,clocks.sm,power.limit,temperature.gpu"
+    fields = "name,driver_version,clocks.max.sm,power.limit"
     try:
         query = ["nvidia-smi", f"--query-gpu={fields}", "--format=csv,noheader"]
         smi = subprocess.run(query, capture_output=True, text=True, timeout=30)
@@ -78,23 +82,48 @@ def child(name: str, side: str, args: argparse.Namespace, limit: float) -> dict:
                     command, env=settings, stdout=log, stderr=subprocess.STDOUT, timeout=limit
                 ).returncode
             except subprocess.TimeoutExpired:
-                return {"status": "out of time", "why": f"not done after {limit:.0f} s"}
+                code = None
             log.seek(0)
-            said = [line.strip() for line in log.read().splitlines() if line.strip()]
+            said = log.read()
+        end = {"log": said[-LOG_CHARACTERS:]}
+        if code is None:
+            return {"status": "out of time", "why": f"not done after {limit:.0f} s"} | end
         if code == 0 and out.exists():
             return json.loads(out.read_text()) | {"wall_seconds": time.perf_counter() - start}
-        why = said[-1][:300] if said else ""
-        short = any(
-            word in " ".join(said[-40:]) for word in ("RESOURCE_EXHAUSTED", "out of memory")
-        )
+        lowered = said[-8000:].lower()
+        short = any(word in lowered for word in ("resource_exhausted", "out of memory"))
         status = "out of memory" if short or code in (-9, 137) else "failed"
-        return {"status": status, "why": f"exit code {code}: {why}"}
+        why = f"exit code {code}: {reason(said)}"
+        return {"status": status, "why": why} | end
+
+
+def reason(said: str) -> str:
+    """Of what a process printed, the last line that names an error; the last line if none does.
+
+    JAX prints a note on the frames that it hides after the error.
+    """
+    lines = [line.strip() for line in said.splitlines() if line.strip()]
+    named = [line for line in lines if re.match(r"[\w.]*(Error|Exception)\b", line)]
+    return (named or lines or [""])[-1][:300]
+
+
+def sides_to_run(row: Any, found: dict, here: str | None, resume: bool) -> list[str]:
+    """The sides of a row that are still to be measured; `here`: the device's name.
+
+    Both again if the row is half done and the other half is of another device: a ratio of two devices says nothing.
+    """
+    halves = {"ours": found, "peer": found.get("peer", {})}
+    done = {s for s in row.sides if halves[s].get("status") == "measured"} if resume else set()
+    if len(done) < len(row.sides):
+        done = {side for side in done if halves[side].get("device") == here}
+    return [side for side in row.sides if side not in done]
 
 
 def table(rows: dict, found: dict) -> str:
     lines = [
-        "| | seconds (quartiles) | TFLOP/s | PyTorch, seconds | ours / PyTorch | floor | must | reach for |",
-        "|---|---|---|---|---|---|---|---|",
+        "| | seconds (quartiles) | TFLOP/s | PyTorch, seconds | ours / PyTorch | floor | must | reach for "
+        "| GB: planned, XLA's, peak | device |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
         x = found.get(name, {"status": "not measured"})
@@ -109,16 +138,22 @@ def table(rows: dict, found: dict) -> str:
         other = x.get("peer", {})
         if other.get("status") == "measured":
             cells[3] = f"{other['seconds']:.4g}"
-            if "seconds" in x:
+            if "seconds" in x and x.get("device") == other.get("device"):
                 cells[4] = f"{x['seconds'] / other['seconds']:.2f}"
         elif other:
             cells[3] = other["status"]
-        lines.append("| " + " | ".join([*cells, *goals]) + " |")
+        sizes = (x.get("planned_gb", {}).get(x.get("remat")), x.get("xla_gb"), x.get("peak_gb"))
+        memory = " / ".join("-" if size is None else f"{size:.3g}" for size in sizes)
+        last = [memory if any(sizes) else "", x.get("device", "")]
+        lines.append("| " + " | ".join([*cells, *goals, *last]) + " |")
     return "\n".join(lines)
 
 
 def chart(rows: dict, found: dict, target: Path) -> None:
-    """Seconds per row, ours and the peer's, with the goals where there are any. Needs matplotlib."""
+    """Seconds per row, ours and the peer's, with the goals where there are any. Needs matplotlib.
+
+    The ladder is drawn only where no row of the published sizes is measured.
+    """
     try:
         import matplotlib
     except ImportError:
@@ -127,6 +162,7 @@ def chart(rows: dict, found: dict, target: Path) -> None:
     import matplotlib.pyplot as plt
 
     names = [n for n in rows if "seconds" in found.get(n, {})]
+    names = [n for n in names if not rows[n].ladder] or names
     if not names:
         return
     figure, axes = plt.subplots(figsize=(9, 0.55 * len(names) + 1.6), layout="constrained")
@@ -171,11 +207,16 @@ def main() -> None:
     import rows as parts
 
     rows = parts.rows()
-    record = {"environment": device(), "rows": {name: {"status": "not measured"} for name in rows}}
-    if args.resume and args.out.exists():
-        kept = json.loads(args.out.read_text())["rows"]
-        record["rows"] |= {n: x for n, x in kept.items() if n in rows and x["status"] == "measured"}
+    environment = device()
+    record = {
+        "environment": environment,
+        "rows": {name: {"status": "not measured"} for name in rows},
+    }
     found = record["rows"]
+    if args.out.exists():
+        kept = json.loads(args.out.read_text())["rows"]
+        found |= {name: x for name, x in kept.items() if name in rows}
+    here = environment.get("device", {}).get("kind")
     args.out.parent.mkdir(parents=True, exist_ok=True)
 
     def limit() -> float:
@@ -189,18 +230,21 @@ def main() -> None:
 
     for name, row in rows.items():
         wanted = row.ladder != gpu or (row.ladder and args.small)
-        if row.group not in groups or not wanted or found[name]["status"] == "measured":
+        if row.group not in groups or not wanted:
             continue
-        for side in ("ours", "peer") if row.group == "dit" else ("ours",):
+        todo = sides_to_run(row, found[name], here, args.resume)
+        for side in todo:
             if limit() < 20:
                 print(f"{name}: no time left", flush=True)
                 break
-            result = child(name, side, args, limit())
+            # The commit at the start: the results, written after every row, are part of it.
+            result = child(name, side, args, limit()) | {"commit": environment.get("commit")}
             if side == "ours":
-                found[name] = result
+                other = {} if "peer" in todo else {"peer": found[name].get("peer")}
+                found[name] = result | {k: v for k, v in other.items() if v}
             else:
                 found[name]["peer"] = result
-            shown = {k: v for k, v in result.items() if k != "quartiles"}
+            shown = {k: v for k, v in result.items() if k not in ("quartiles", "log")}
             print(f"{name}, {side}: {shown}", flush=True)
             save()
     save()

@@ -196,8 +196,10 @@ def velocity(
     contexts: int,
     text: Tree | None = None,
     remat: dit.Remat = "none",
+    unroll: int = 1,
 ) -> jax.Array:
-    """V(x, sigma; C) [t, lh, lw, 16], noise - x0. `text` caches `text_cache` over sampling steps."""
+    """V(x, sigma; C) [t, lh, lw, 16], noise - x0. `text` caches `text_cache` over sampling steps; `unroll`
+    blocks make a turn of the loop over them."""
     cfg = config.dit
     t, lh, lw, _ = x.shape
     angles = dit.rope_angles(
@@ -216,6 +218,7 @@ def velocity(
         kv=text,
         extra_tokens=cond.tokens,
         remat=remat,
+        unroll=unroll,
     )
     return preview.velocity(output, x, sigma, cond, contexts)
 

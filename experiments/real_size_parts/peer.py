@@ -1,14 +1,15 @@
 """The peer of the transformer's rows: the same network in PyTorch, in a process of its own on the same device.
 
-diffusers' `WanTransformer3DModel` where diffusers is installed, else the same blocks written out below. Compiled on a
-GPU (eager where compiling fails, which is said); attention by whichever of PyTorch's kernels is fastest there.
+diffusers' `WanTransformer3DModel` where diffusers can be imported, else the same blocks written out below; the row says
+which, and why. Compiled on a GPU (eager where compiling fails, which is said); attention by whichever of PyTorch's kernels is fastest there.
 It computes the keys and values of the text in every call, which ours caches (1.5 % of the 192x336 forward).
 """
 
 import os
 from typing import Any
 
-from rows import Row, forward_flops, measure
+from rows import Row, forward_flops
+from timing import measure
 
 
 def run(row: Row, repeats: int, seconds: float) -> dict[str, Any]:
@@ -23,11 +24,16 @@ def run(row: Row, repeats: int, seconds: float) -> dict[str, Any]:
         return {"status": "not measured", "why": "this PyTorch sees no GPU"}
     if not gpu:
         torch.set_num_threads(len(os.sched_getaffinity(0)))
+    found: dict[str, Any] = {"torch": torch.__version__, "network": "diffusers", "kernels": {}}
     try:
-        net, arguments, made_by = diffusers_network(row, gpu)
-    except ImportError:
-        net, arguments, made_by = plain_network(row, gpu)
-    found: dict[str, Any] = {"torch": torch.__version__, "network": made_by, "kernels": {}}
+        net, arguments = diffusers_network(row, gpu)
+    except torch.cuda.OutOfMemoryError as error:
+        raise MemoryError(str(error).splitlines()[0][:300]) from error
+    except (
+        Exception
+    ) as error:  # its imports are lazy: what does not fit together raises errors of many kinds
+        found |= {"network": "plain PyTorch blocks", "why_not_diffusers": str(error)[:300]}
+        net, arguments = plain_network(row, gpu)
     best: dict[str, Any] = {}
     for name, kernel in kernels(gpu).items():
         try:
@@ -126,7 +132,7 @@ def diffusers_network(row: Row, gpu: bool):
         arguments["encoder_hidden_states_image"] = torch.randn(
             1, d.clip_rows, d.clip_dim, device=device, dtype=kind
         )
-    return net, arguments, "diffusers"
+    return net, arguments
 
 
 def plain_network(row: Row, gpu: bool):
@@ -193,4 +199,4 @@ def plain_network(row: Row, gpu: bool):
         "cos": angles.cos().to(kind),
         "sin": angles.sin().to(kind),
     }
-    return _fill(net, kind, device), arguments, "plain PyTorch blocks"
+    return _fill(net, kind, device), arguments

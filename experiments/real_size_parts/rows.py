@@ -2,7 +2,7 @@
 
     python rows.py --row NAME --side ours|peer --out FILE [--repeats 10] [--seconds 600]
 
-FILE gets the row as JSON. Random weights, inputs of zeros and noise; bfloat16 matrices on a GPU, float32 on a CPU.
+FILE gets the row as JSON. Random weights and inputs; bfloat16 matrices on a GPU, float32 on a CPU.
 """
 
 import argparse
@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from timing import measure, where_and_when
 
 from roge_jax import config as presets
 from roge_jax import cost, model, programs
 from roge_jax.config import RoGeConfig
-from roge_jax.core.params import Tree, flatten, unflatten
+from roge_jax.core.params import Tree, fan_in, flatten, init, normal, unflatten, zeros
 from roge_jax.fusion import Condition
 from roge_jax.recon.vggt import encoder_grid
 from roge_jax.training import estimate, stages
@@ -31,7 +32,11 @@ from roge_jax.video import flow, solvers
 
 
 class Row(NamedTuple):
-    """One line of the table. Floor, "must" and "reach for" are goals for one H100 or H200, in seconds."""
+    """One line of the table. Floor, "must" and "reach for" are goals for one H100 or H200, in seconds.
+
+    `remat` (of train): this policy alone, None: the first that fits. `unroll` (of dit): blocks per turn of the loop;
+    only the plain form has a peer. `part` (of numerics): dit, encoder or rays.
+    """
 
     group: str  # dit, train, vggt, rays, render, vae, sample, numerics
     config: RoGeConfig
@@ -40,6 +45,13 @@ class Row(NamedTuple):
     must: float | None = None
     reach: float | None = None
     ladder: bool = False
+    remat: str | None = None
+    unroll: int = 1
+    part: str = "dit"
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        return ("ours", "peer") if self.group == "dit" and self.unroll == 1 else ("ours",)
 
 
 def sized(base: RoGeConfig, **changes) -> RoGeConfig:
@@ -58,13 +70,15 @@ def rows() -> dict[str, Row]:
     large = sized(paper, height=480, width=832)
     shallow = sized(paper, dit=dataclasses.replace(paper.dit, depth=2))
     views = {"recon_height": 512, "recon_width": 512, "frames": 9}
+    encoder_336x518 = {"recon_height": 344, "recon_width": 528}  # what the encoder resizes them to
+    few = sized(paper, frames=9)
     found = {
         "DiT-14B forward, 192x336, M=6, N=81": Row("dit", paper, 6, 0.275, 0.38, 0.31),
         "DiT-14B forward, 480x832, M=6, N=81": Row("dit", large, 6, 3.67, 4.6, 3.85),
         "LoRA joint step, 192x336, batch 1": Row("train", paper, 6, 1.2, 2.9, 1.9),
         "LoRA step, 480x832, reconstruction frozen": Row("train", large, 6, 12.3, 19.0, 15.0),
         "VGGT-1B, 10 views at 336x518": Row(
-            "vggt", sized(paper, recon_height=336, recon_width=520), 10, 0.033, 0.080, 0.055
+            "vggt", sized(paper, **encoder_336x518), 10, 0.033, 0.080, 0.055
         ),
         "renderer 512x512, 2 views, per frame": Row(
             "render", sized(paper, **views), 2, 0.0035, 1 / 90, 1 / 150
@@ -73,6 +87,13 @@ def rows() -> dict[str, Row]:
         "VAE decode, 81 frames, 480x832": Row("vae", large, 6, 0.69, 2.0, 1.0),
         "81 frames, 50 steps, 192x336, everything included": Row("sample", paper, 6, 14.3, 20, 16),
         "bfloat16 against float32: 2 blocks of DiT-14B, 192x336": Row("numerics", shallow, 6),
+        "bfloat16 against float32: VGGT-1B, 6 views": Row("numerics", few, 6, part="encoder"),
+        "bfloat16 against float32: 15 ray features": Row("numerics", few, 6, part="rays"),
+        "DiT-14B, 192x336, 4 blocks per turn": Row("dit", paper, 6, unroll=4),
+        "DiT-14B, 192x336, no loop": Row("dit", paper, 6, unroll=paper.dit.depth),
+        "LoRA joint step, 192x336, remat dots": Row("train", paper, 6, remat="dots"),
+        "LoRA joint step, 192x336, remat attention": Row("train", paper, 6, remat="attention"),
+        "LoRA joint step, 192x336, remat full": Row("train", paper, 6, remat="full"),
     }
     small = {
         "ladder: DiT forward, width 128, 4 blocks": Row("dit", _ladder(128, 4), 3),
@@ -85,6 +106,12 @@ def rows() -> dict[str, Row]:
         "ladder: VAE decode, mini": Row("vae", mini, 3),
         "ladder: 50 steps, everything included, tiny": Row("sample", tiny, 3),
         "ladder: bfloat16 against float32, width 128": Row("numerics", _ladder(128, 4), 3),
+        "ladder: bfloat16 against float32, encoder of mini": Row(
+            "numerics", mini, 3, part="encoder"
+        ),
+        "ladder: bfloat16 against float32, rays of mini": Row("numerics", mini, 3, part="rays"),
+        "ladder: DiT, width 384, 8 blocks, no loop": Row("dit", _ladder(384, 8), 3, unroll=8),
+        "ladder: LoRA joint step, tiny, remat full": Row("train", tiny, 3, remat="full"),
     }
     return found | {name: row._replace(ladder=True) for name, row in small.items()}
 
@@ -93,23 +120,35 @@ def rows() -> dict[str, Row]:
 
 
 def weights(specs: Tree, dtype: Any) -> Tree:
-    """Random leaves made of one short random vector: no time is spent on drawing billions of numbers."""
-    base = 0.02 * jax.random.normal(jax.random.key(0), (1 << 16,))
+    """Random leaves made of one short random vector: no time is spent on drawing billions of numbers.
 
-    def fill(shape: tuple[int, ...], kind: Any) -> jax.Array:
+    Its length is prime, so that no two rows of a matrix are equal; scales of norms lie around 1.
+    """
+    base = 0.02 * jax.random.normal(jax.random.key(0), (65_521,))
+
+    def fill(shape: tuple[int, ...], kind: Any, mean: float) -> jax.Array:
         n = int(np.prod(shape))
         times = -(-n // base.size)
-        return (
-            jnp.broadcast_to(base.astype(kind)[None], (times, base.size))
-            .reshape(-1)[:n]
-            .reshape(shape)
-        )
+        values = (base + mean).astype(kind)
+        return jnp.broadcast_to(values[None], (times, base.size)).reshape(-1)[:n].reshape(shape)
 
-    make = jax.jit(fill, static_argnums=(0, 1))
+    make = jax.jit(fill, static_argnums=(0, 1, 2))
+
+    def leaf(path: str, shape: tuple[int, ...]) -> jax.Array:
+        kind = jnp.float32 if cost.keeps_float32(path) else dtype
+        return make(shape, kind, float(path.endswith(("/scale", "/gamma"))))
+
+    return unflatten({path: leaf(path, spec.shape) for path, spec in flatten(specs).items()})
+
+
+def initial_weights(specs: Tree) -> Tree:
+    """The specs' own initial values, float32, and random ones where they are zero (the head's kernel, the prompt)."""
+    drawn = {"kernel": fan_in(), "rows": normal(1.0)}
     flat = flatten(specs)
-    return unflatten(
-        {p: make(s.shape, jnp.float32 if cost.keeps_float32(p) else dtype) for p, s in flat.items()}
-    )
+    for path, spec in flat.items():
+        if spec.init is zeros and (other := drawn.get(path.rpartition("/")[2])):
+            flat[path] = spec._replace(init=other)
+    return init(jax.random.key(0), unflatten(flat))
 
 
 def cameras(cfg: RoGeConfig, m: int, n: int) -> dict[str, jax.Array]:
@@ -119,11 +158,21 @@ def cameras(cfg: RoGeConfig, m: int, n: int) -> dict[str, jax.Array]:
 
 
 def photos(cfg: RoGeConfig, m: int) -> dict[str, jax.Array]:
+    first, second, third = jax.random.split(jax.random.key(3), 3)
     return {
-        "vectors": jnp.zeros((m, 11)),
-        "context_rgb": jnp.full((m, cfg.height, cfg.width, 3), 0.5),
-        "context_recon": jnp.full((m, cfg.recon_height, cfg.recon_width, 3), 0.5),
+        "vectors": jax.random.normal(first, (m, 11)),
+        "context_rgb": jax.random.uniform(second, (m, cfg.height, cfg.width, 3)),
+        "context_recon": jax.random.uniform(third, (m, cfg.recon_height, cfg.recon_width, 3)),
     }
+
+
+def random_condition(cfg: RoGeConfig, m: int) -> Condition:
+    first, second = jax.random.split(jax.random.key(2))
+    tokens = cost.tokens_per_slot(cfg) * cfg.slots(m)
+    return Condition(
+        jax.random.normal(first, (cfg.slots(m), *cfg.latent_size, 20)),
+        jax.random.normal(second, (tokens, cfg.dit.width)),
+    )
 
 
 class Job(NamedTuple):
@@ -140,7 +189,16 @@ def compiled(function: Callable, *arguments, flops: float, frames: int = 1) -> J
     start = time.perf_counter()
     run = jax.jit(function).lower(*arguments).compile()
     seconds = time.perf_counter() - start
-    return Job(lambda: jax.block_until_ready(run(*arguments)), flops, seconds, frames)
+    call = functools.partial(run, *arguments)
+    return Job(lambda: jax.block_until_ready(call()), flops, seconds, frames, allocated(run))
+
+
+def allocated(run: jax.stages.Compiled) -> dict[str, float]:
+    """XLA's own analysis of a compiled program: arguments and temporary memory, GB."""
+    used = run.memory_analysis()
+    if used is None:  # not every backend has one
+        return {}
+    return {"xla_gb": (used.argument_size_in_bytes + used.temp_size_in_bytes) / 1e9}
 
 
 def job(row: Row, dtype: Any) -> Job:
@@ -159,8 +217,8 @@ def job(row: Row, dtype: Any) -> Job:
     if row.group == "dit":
         params = pick("dit", "prompt")
         text = jax.jit(functools.partial(model.text_cache, config=cfg))(params)
-        cond = Condition(jnp.zeros((slots, lh, lw, 20)), jnp.zeros((tokens, cfg.dit.width)))
-        forward = functools.partial(model.velocity, config=cfg, contexts=m)
+        cond = random_condition(cfg, m)
+        forward = functools.partial(model.velocity, config=cfg, contexts=m, unroll=row.unroll)
         return compiled(
             lambda p, x, cond, text: forward(p, x, jnp.float32(0.5), cond, text=text),
             *(params, noise, cond, text), flops=cost.velocity(cfg.dit, tokens),
@@ -181,8 +239,8 @@ def job(row: Row, dtype: Any) -> Job:
             features = model.query_rays(p, z, targets, config=cfg, context=views)
             return model.decode_rgb(p, features, targets, config=cfg, context=views)
 
-        flops = n * cost.renderer_view(cfg.renderer, *size, m * grid[0] * grid[1])
-        return compiled(pictures, pick("renderer"), z, targets, views, flops=flops, frames=n)
+        inputs = (pick("renderer"), z, targets, views)
+        return compiled(pictures, *inputs, flops=render_flops(cfg, m), frames=n)
     if row.group == "vae":
         run = functools.partial(programs.decode, config=cfg, contexts=m)
         flops = cost.vae_decode(cfg.vae, n, cfg.height, cfg.width)
@@ -213,13 +271,15 @@ def whole_video(cfg: RoGeConfig, m: int, params: Tree, views: model.Views, noise
 
 
 def training_step(row: Row, dtype: Any) -> Job:
-    """One LoRA step with the policy that recomputes least of those that fit: loss, gradient, AdamW, state donated."""
+    """One LoRA step: loss, gradient, AdamW, state donated. With the row's policy, or else with the one that
+    recomputes least of those that fit."""
     cfg, m = row.config, row.m
     hires = cfg.height > 192
     stage = stages.lora_stage(100, frames=cfg.frames, hires=hires)
     limit = (jax.local_devices()[0].memory_stats() or {}).get("bytes_limit", 64e9)
-    needs, failed = {}, ""
-    for remat in ("none", "dots", "attention", "full"):
+    needs: dict[str, float] = {}
+    failed: list[str] = []
+    for remat in (row.remat,) if row.remat else ("none", "dots", "attention", "full"):
         stage = dataclasses.replace(stage, remat=remat)
         found = estimate.estimate(
             cfg, stage, m=m, dtype=dtype, fused_attention=dtype == jnp.bfloat16
@@ -228,29 +288,32 @@ def training_step(row: Row, dtype: Any) -> Job:
         if found.bytes > 1.1 * limit:  # the estimate may be too high: near misses are tried
             continue
         try:
-            return _step(cfg, stage, m, dtype, found, needs)
+            done = _step(cfg, stage, m, dtype, found)
+            tried = {"failed": failed} if failed else {}
+            return done._replace(notes=done.notes | {"planned_gb": needs} | tried)
         except jax.errors.JaxRuntimeError as error:
             if "RESOURCE_EXHAUSTED" not in str(error):
                 raise
-            failed = remat
+            failed.append(remat)
     raise MemoryError(
         f"no policy fits {limit / 1e9:.0f} GB; planned GB: {needs}"
-        + (f"; tried and failed: {failed}" if failed else "")
+        + (f"; tried and failed: {', '.join(failed)}" if failed else "")
     )
 
 
 def _step(
-    cfg: RoGeConfig, stage: stages.Stage, m: int, dtype: Any, found: estimate.Estimate, needs
+    cfg: RoGeConfig, stage: stages.Stage, m: int, dtype: Any, found: estimate.Estimate
 ) -> Job:
     start = time.perf_counter()
     specs, frozen_specs = stages.stage_specs(cfg, stage)
     step, shapes = estimate.abstract_step(cfg, stage, m, scenes=1, dtype=dtype)
-    run = jax.jit(step, donate_argnums=0).lower(*shapes).compile()
+    # Weights that a step does not read (the VAE's decoder) still lie on the device, and are planned for.
+    run = jax.jit(step, donate_argnums=0, keep_unused=True).lower(*shapes).compile()
     seconds = time.perf_counter() - start
     frozen = weights(frozen_specs, dtype)
     optimiser = make_optimiser(stage.optim, specs, stage.steps)
     state = [initial_state(weights(specs, jnp.float32), optimiser, stage.optim)]
-    batch = {name: jnp.full(x.shape, 0.5) for name, x in shapes[2].items()}
+    batch = {n: jax.random.uniform(jax.random.key(3), x.shape) for n, x in shapes[2].items()}
     batch |= {k: v[None] for k, v in cameras(cfg, m, cfg.frames).items()}
 
     def call():
@@ -258,67 +321,67 @@ def _step(
         return float(metrics["loss"])
 
     call()  # the first allocation of everything: whether it fits shows here
-    return Job(call, found.flops, seconds, notes={"remat": stage.remat, "planned_gb": needs})
+    return Job(call, found.flops, seconds, notes={"remat": stage.remat, **allocated(run)})
 
 
 # ---- measuring -----------------------------------------------------------------------------------
 
 
-def measure(call: Callable[[], Any], repeats: int, seconds: float) -> dict[str, Any]:
-    """Seconds per call after two calls to warm up: median and quartiles of `repeats`, fewer if `seconds` are over.
-
-    On a CPU these are CPU seconds: wall time measures the neighbours.
-    """
-    clock = time.process_time if jax.default_backend() == "cpu" else time.perf_counter
-    begin, taken = time.perf_counter(), []
-    for turn in range(repeats + 2):
-        start = clock()
-        call()
-        if turn >= 2:
-            taken.append(clock() - start)
-        if taken and time.perf_counter() - begin > seconds:
-            break
-    low, median, high = np.percentile(taken, [25, 50, 75])
-    return {"seconds": float(median), "quartiles": [float(low), float(high)], "calls": len(taken)}
-
-
-def ours(row: Row, repeats: int, seconds: float) -> dict[str, Any]:
-    """The measured row: seconds, compile seconds, TFLOP/s, peak memory."""
-    dtype = jnp.bfloat16 if jax.default_backend() == "gpu" else jnp.float32
+def ours(row: Row, repeats: int, seconds: float, dtype: Any = None) -> dict[str, Any]:
+    """The measured row: seconds, compile seconds, TFLOP/s, memory. `dtype` of large matrices: None is the device's."""
     if row.group == "numerics":
         return numerics(row)
+    if dtype is None:
+        dtype = jnp.bfloat16 if jax.default_backend() == "gpu" else jnp.float32
     work = job(row, dtype)
     found = measure(work.call, repeats, seconds)
     found["seconds"] /= work.frames
     found["quartiles"] = [x / work.frames for x in found["quartiles"]]
+    notes = work.notes or {}
     found |= {
         "flops": work.flops / work.frames,
         "compile_seconds": work.compile_seconds,
-    } | (work.notes or {})
+    } | notes
     found["tflops"] = found["flops"] / found["seconds"] / 1e12
     stats = jax.local_devices()[0].memory_stats() or {}
-    if "peak_bytes_in_use" in stats:  # of this process, which ran nothing else
+    # Of this process, which ran nothing else; what a policy that did not fit has taken would hide the one that did.
+    if "peak_bytes_in_use" in stats and not notes.get("failed"):
         found["peak_gb"] = stats["peak_bytes_in_use"] / 1e9
     return found
 
 
 def numerics(row: Row) -> dict[str, Any]:
-    """Relative L2 difference of the fast path (bfloat16 matrices, fused attention) from float32 throughout."""
+    """Relative L2 difference of the fast path (bfloat16 matrices, fused attention) from float32 throughout.
+
+    On the specs' own initial values: scales of norms are 1, so that the softmax of attention is far from uniform.
+    """
     cfg, m = row.config, row.m
-    specs = {k: v for k, v in model.specs(cfg).items() if k in ("dit", "prompt")}
-    tokens = cost.tokens_per_slot(cfg) * cfg.slots(m)
-    shape = (cfg.slots(m), *cfg.latent_size)
-    noise = jax.random.normal(jax.random.key(1), (*shape, 16))
-    tokens_in = jax.random.normal(jax.random.key(2), (tokens, cfg.dit.width))
+    noise = jax.random.normal(jax.random.key(1), (cfg.slots(m), *cfg.latent_size, 16))
+    views, cond = cameras(cfg, m, cfg.frames) | photos(cfg, m), random_condition(cfg, m)
+    grid = encoder_grid(cfg.encoder, cfg.recon_height, cfg.recon_width)
+    z = jax.random.normal(jax.random.key(4), (m, grid[0] * grid[1], cfg.renderer.width))
+    velocity = functools.partial(model.velocity, config=cfg, contexts=m)
+    names, run, inputs = {
+        "dit": (("dit", "prompt"), velocity, (noise, jnp.float32(0.5), cond)),
+        "encoder": (("encoder",), functools.partial(model.reconstruct, config=cfg), (views,)),
+        "rays": (("renderer",), functools.partial(model.query_rays, config=cfg), (z, views)),
+    }[row.part]
+    whole = flatten(initial_weights({k: s for k, s in model.specs(cfg).items() if k in names}))
     results = []
     for dtype in (jnp.float32, jnp.bfloat16):
+        kept = {p: x if cost.keeps_float32(p) else x.astype(dtype) for p, x in whole.items()}
         with jax.default_matmul_precision("highest" if dtype == jnp.float32 else "default"):
-            run = jax.jit(functools.partial(model.velocity, config=cfg, contexts=m))
-            cond = Condition(jnp.zeros((*shape, 20)), tokens_in)
-            out = run(weights(specs, dtype), noise, jnp.float32(0.5), cond)
-            results.append(np.asarray(out, np.float64))
+            out = jax.jit(run)(unflatten(kept), *inputs)
+        results.append(np.asarray(out, np.float64))
     exact, fast = results
     return {"relative_error": float(np.linalg.norm(fast - exact) / np.linalg.norm(exact))}
+
+
+def render_flops(cfg: RoGeConfig, m: int) -> float:
+    """Of the pictures of all targets: ray features, RGB head and, where there is one, the look-up in m photos."""
+    size = (cfg.recon_height, cfg.recon_width)
+    per_view = cost.renderer_view(cfg.renderer, *size, cost.scene_tokens_read(cfg, m))
+    return cfg.frames * per_view + cost.lookup(cfg.renderer, *size, m, cfg.frames)
 
 
 def forward_flops(row: Row) -> float:
@@ -350,7 +413,7 @@ def main() -> None:
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         found = {"status": "out of memory", "why": str(error).splitlines()[0][:300]}
-    args.out.write_text(json.dumps(found))
+    args.out.write_text(json.dumps(found | where_and_when()))
 
 
 if __name__ == "__main__":
