@@ -323,6 +323,13 @@ def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
     return a == (*head, int(np.prod(ins)), rank) and b == (*head, rank, d_out)
 
 
+def load_provenance(folder: Path) -> dict[str, Any]:
+    """What the config.json of a model or adapter folder says of its origin; {} if nothing."""
+    record = read_json(Path(folder) / "config.json", "model config")
+    found = record.get("provenance") if isinstance(record, dict) else None
+    return found if isinstance(found, dict) else {}
+
+
 def load_config(folder: Path) -> RoGeConfig:
     """The configuration of a model or adapter folder. Raises: UserError if its config.json is damaged or of
     another kind.

@@ -118,10 +118,11 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
                 importer.Fill(path, i, source, path, functools.partial(_merged, factors, i))
             )
     given = {p: np.asarray(x) for p, x in changed.items() if not p.endswith(("lora_a", "lora_b"))}
-    record = json.loads((folder / "config.json").read_text()).get("provenance", {})
-    trained = json.loads((adapter / "config.json").read_text()).get("provenance", {})
     half = any(t.dtype == DTYPES["BF16"] for t in source.tensors.values())
-    provenance = {"merged": trained, "base": record}
+    provenance = {
+        "merged": checkpoint.load_provenance(adapter),
+        "base": checkpoint.load_provenance(folder),
+    }
     plan = importer.Plan(config, specs, fills, given, half, provenance)
     importer.check_coverage(fills, specs)
     importer.write(plan, out, shard_bytes=shard_bytes)

@@ -139,7 +139,7 @@ def main(args: argparse.Namespace) -> None:
     from .training import start
 
     preset, init = config.preset(args.preset), starting_point(args)
-    with on_host():
+    with start.on_host():
         if init == "scratch":
             from . import model
 
@@ -177,11 +177,11 @@ def choose(args: argparse.Namespace, cfg):
     from . import model
     from .core.params import count
     from .errors import UserError
-    from .training import estimate
+    from .training import estimate, start
     from .training import stages as stages_
 
     if args.stage == "hires" or args.size:
-        cfg = resize(cfg, args.size, hires=args.stage == "hires")
+        cfg = start.resize(cfg, args.size, hires=args.stage == "hires")
     side = min(cfg.height, cfg.width)
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames, side=side)
     for hires in (False, True):
@@ -248,51 +248,10 @@ def dry_run(args: argparse.Namespace) -> str:
 
 def stage_size(args: argparse.Namespace, stage, cfg):
     """The configuration in a stage: `hires` doubles the size within 'all'; alone, `choose` has set it."""
+    from .training.start import resize
+
     again = args.stage == "all" and stage.name == "hires"
     return resize(cfg, None, hires=True) if again else cfg
-
-
-def resize(cfg, size: str | None, *, hires: bool):
-    """The configuration at another size (None: twice its own); in `hires` the reconstruction keeps its own (Sec. 3.3)."""
-    from .errors import UserError
-
-    if size is None:
-        height, width = 2 * cfg.height, 2 * cfg.width
-    else:
-        try:
-            height, width = (int(x) for x in size.lower().split("x"))
-        except ValueError:
-            raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
-    recon = cfg.recon_height, cfg.recon_width
-    if not hires:
-        recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
-    sizes = {"height": height, "width": width, "recon_height": recon[0], "recon_width": recon[1]}
-    return dataclasses.replace(cfg, **sizes)
-
-
-def on_host():
-    """A context in which new arrays are kept in host memory: a whole model may not fit one accelerator."""
-    import jax
-
-    try:
-        cpu = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:  # JAX_PLATFORMS without cpu
-        return contextlib.nullcontext()
-    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
-
-
-def in_precision(frozen, dtype: str):
-    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
-    from .core.params import flatten, unflatten
-    from .cost import keeps_float32
-
-    with on_host():
-        return unflatten(
-            {
-                path: x if keeps_float32(path) else x.astype(dtype)
-                for path, x in flatten(frozen).items()
-            }
-        )
 
 
 def run_stage(args, stage, params, cfg, mesh, base: str):
@@ -308,6 +267,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     from .training import loop, stages, start
 
     out = args.out / stage.name
+    before = start.provenance(base)
     say = print if distributed.is_main() else (lambda *_: None)
     dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
@@ -328,7 +288,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         )
     if done:
         say(f"{stage.name}: already trained, {out / 'model'}")
-        with on_host():
+        with start.on_host():
             return checkpoint.load_model(out / "model")
     for line in told:
         say(line)
@@ -349,7 +309,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
     frozen = stages.read(frozen, stage)
     if dtype != "float32":
-        frozen = in_precision(frozen, dtype)
+        frozen = start.in_precision(frozen, dtype)
     if mesh is not None:  # now, so that no device ever holds all of it twice
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     if args.show_mesh:
@@ -407,7 +367,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    with on_host():
+    with start.on_host():
         params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
@@ -420,13 +380,15 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         "stage": stage.name,
         "steps": int(state["step"]),
         "skipped": int(state["skipped"]),
+        "base": base,
+        "base_provenance": before,
     }
     if distributed.is_main():
         checkpoint.save_model(
             out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
         )
         if stage.lora:
-            provenance |= {"base": base, "data": str(args.data or "procedural scenes")}
+            provenance |= {"data": str(args.data or "procedural scenes")}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
         print(f"{stage.name}: saved {out / 'model'}{change}")

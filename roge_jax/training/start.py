@@ -1,10 +1,16 @@
 """What a stage starts from: where its sequences come from, and whether a run that goes on is still the same one."""
 
+import contextlib
+import dataclasses
 from pathlib import Path
+from typing import Any
 
-from ..checkpoint import model_fingerprint
+import jax
+
+from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
-from ..core.params import Tree
+from ..core.params import Tree, flatten, unflatten
+from ..cost import keeps_float32
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
@@ -65,3 +71,45 @@ def hold_settings(
             "compared"
         )
     return told
+
+
+def provenance(start: str) -> dict[str, Any]:
+    """Where the model to start from comes from, as its own config.json says; {} for 'scratch'."""
+    return {} if start == "scratch" else load_provenance(find_model(start))
+
+
+def resize(cfg: RoGeConfig, size: str | None, *, hires: bool) -> RoGeConfig:
+    """The configuration at another size (None: twice its own); in `hires` the reconstruction keeps its own (Sec. 3.3)."""
+    if size is None:
+        height, width = 2 * cfg.height, 2 * cfg.width
+    else:
+        try:
+            height, width = (int(x) for x in size.lower().split("x"))
+        except ValueError:
+            raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
+    recon = cfg.recon_height, cfg.recon_width
+    if not hires:
+        recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
+    return dataclasses.replace(
+        cfg, height=height, width=width, recon_height=recon[0], recon_width=recon[1]
+    )
+
+
+def on_host() -> contextlib.AbstractContextManager:
+    """A context in which new arrays are kept in host memory: a whole model may not fit one accelerator."""
+    try:
+        cpu = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS without cpu
+        return contextlib.nullcontext()
+    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
+
+
+def in_precision(frozen: Tree, dtype: str) -> Tree:
+    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
+    with on_host():
+        return unflatten(
+            {
+                path: x if keeps_float32(path) else x.astype(dtype)
+                for path, x in flatten(frozen).items()
+            }
+        )
