@@ -130,15 +130,17 @@ def main(args: argparse.Namespace) -> None:
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
 
+    from . import __version__, checkpoint, config
+
     distributed.maybe_initialise_distributed()
+    from .training import start
+
+    preset, init = config.preset(args.preset), starting_point(args)
+    start.check_processes(vars(args), init, args.data, version=__version__)
     devices = jax.devices()[: args.devices] if args.devices else jax.devices()
     plain = len(devices) == 1 and not sizes and devices[0].platform == "cpu"
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
-    from . import checkpoint, config
-    from .training import start
-
-    preset, init = config.preset(args.preset), starting_point(args)
     with start.on_host():
         if init == "scratch":
             from . import model

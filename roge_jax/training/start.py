@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import jax
 
 from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
+from ..core import distributed
 from ..core.params import Tree, flatten, unflatten
 from ..cost import keeps_float32
 from ..data.source import open_source
@@ -56,7 +58,7 @@ def hold_settings(
         "data contents": "procedural scenes",
     }
     if pool is not None:
-        settings["data contents"] = fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
+        settings["data contents"] = pool_fingerprint(pool)
     notes = {"start": start, "data": str(pool or "procedural scenes"), "steps": stage.steps}
     before = keep_settings(out, settings, begun=begun, resume=resume, notes=notes)
     told = []
@@ -71,6 +73,33 @@ def hold_settings(
             "compared"
         )
     return told
+
+
+def check_processes(
+    options: Mapping[str, Any], start: str, pool: Path | None, *, version: str
+) -> None:
+    """Raise UserError in every process of a run that was not started alike everywhere: options, code, model or data."""
+    if jax.process_count() == 1:
+        return
+    if options.get("devices"):
+        raise UserError(
+            f"--devices {options['devices']} is for one process, and {jax.process_count()} are running: leave it out."
+        )
+    found = {f"--{name.replace('_', '-')}": value for name, value in options.items()}
+    found |= {"roge_jax": version, "JAX": jax.__version__}
+    distributed.check_same(found, "start every process with the same options and versions")
+    contents = {}
+    if start != "scratch":
+        files = find_model(start)
+        contents["a start with contents"] = fingerprint_files(files, "*.safetensors", "config.json")
+    if pool is not None:
+        contents["data with contents"] = pool_fingerprint(pool)
+    distributed.check_same(contents, "every process must see the same files")
+
+
+def pool_fingerprint(pool: Path) -> str:
+    """`folders.fingerprint_files` of a pool."""
+    return fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
 
 
 def provenance(start: str) -> dict[str, Any]:
