@@ -88,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: argparse.Namespace) -> None:
     """Convert, or print what would be done. Raises: UserError with all mismatches, before anything is written."""
     from .errors import UserError
+    from .folders import check_disk
     from .weights import importer
 
     if args.out is None and not args.dry_run:
@@ -100,7 +101,8 @@ def main(args: argparse.Namespace) -> None:
     layout = plan.layout(1e9 * args.shard_gb)
     print(summary(plan, filled, layout))
     if args.out is not None:
-        importer.check_disk(args.out.with_name(args.out.name + ".part"), sum(layout.sizes))
+        part = importer.check_output(args.out)
+        check_disk(sum(layout.sizes), part, held=[part])
     if args.dry_run:
         return
     from tqdm import tqdm

@@ -133,6 +133,23 @@ def output_file(file: Path, option: str, *suffixes: str) -> Path:
     return file
 
 
+def check_disk(
+    needed: float, folder: Path, what: str = "The model", held: Iterable[Path] = ()
+) -> None:
+    """Raise UserError unless the disk of `folder` has room for `needed` bytes beside those that `held` have taken."""
+    place = Path(folder)
+    while not place.exists():
+        place = place.parent
+    files = (file for one in held for file in one.rglob("*") if file.is_file())
+    have = sum(512 * getattr(f.stat(), "st_blocks", 0) for f in files)
+    free = shutil.disk_usage(place).free
+    if needed - have > free:
+        raise UserError(
+            f"{what} needs {needed / 1e9:.2f} GB at {place.resolve()}, where {free / 1e9:.2f} GB are free: "
+            "make room or give another --out."
+        )
+
+
 def keep_settings(
     folder: Path,
     settings: dict[str, Any],

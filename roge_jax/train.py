@@ -130,32 +130,49 @@ def main(args: argparse.Namespace) -> None:
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
 
-    from . import __version__, checkpoint, config
+    from . import __version__, checkpoint, config, model
 
     distributed.maybe_initialise_distributed()
     from .training import start
 
     preset, init = config.preset(args.preset), starting_point(args)
     start.check_processes(vars(args), init, args.data, version=__version__)
-    devices = jax.devices()[: args.devices] if args.devices else jax.devices()
+    devices = start.find_devices(args.devices)
     plain = len(devices) == 1 and not sizes and devices[0].platform == "cpu"
     mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
+    cfg = preset if init == "scratch" else checkpoint.load_config(checkpoint.find_model(init))
+    check_preset(preset, cfg, init)
+    found = cfg
+    cfg, chosen = choose(args, cfg)
+    check(args, cfg, chosen, mesh)  # now, not after hours
     with start.on_host():
         if init == "scratch":
-            from . import model
-
-            params, cfg = model.init(jax.random.key(args.seed), preset), preset
+            params = model.init(jax.random.key(args.seed), found)
         else:
-            params, cfg = checkpoint.load_model(init)
-    check_preset(preset, cfg, init)
-    cfg, chosen = choose(args, cfg)
-    if args.stage == "all" and args.data:
-        for stage in chosen:  # now, not after hours
-            start.open_data(args.data, stage, stage_size(args, stage, cfg))
+            params, _ = checkpoint.load_model(init)
     for stage in chosen:
         params, cfg = run_stage(args, stage, params, stage_size(args, stage, cfg), mesh, init)
         init = str(args.out / stage.name / "model")
+
+
+def check(args: argparse.Namespace, cfg, chosen, mesh) -> None:
+    """Raise UserError if a stage does not fit data, mesh, memory or disk; print a line where memory may be short."""
+    import jax
+
+    from .core import distributed
+    from .training import room, start
+
+    dtype, fused = start.kept_dtype(args.frozen_dtype), jax.default_backend() == "gpu"
+    recipe = [(stage, stage_size(args, stage, cfg)) for stage in chosen]
+    for stage, sized in recipe:
+        if args.data:
+            start.open_data(args.data, stage, sized)
+        room.check_layout(sized, stage, mesh, fused=fused)
+    room.check_space(args.out, recipe, save_every=args.save_every)
+    for line in [room.check_room(stage, sized, mesh, dtype=dtype) for stage, sized in recipe]:
+        if line and distributed.is_main():
+            print(line)
 
 
 def starting_point(args: argparse.Namespace) -> str:
@@ -217,7 +234,7 @@ def dry_run(args: argparse.Namespace) -> str:
     from .core import sharding
     from .core.params import count
     from .errors import UserError
-    from .training import estimate, loop
+    from .training import estimate, room
 
     init = starting_point(args)
     cfg = config.preset(args.preset)
@@ -228,9 +245,9 @@ def dry_run(args: argparse.Namespace) -> str:
     large = count(model.specs(cfg)) > estimate.LARGE
     dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
-    if args.devices:
-        sizes.setdefault("data", max(1, args.devices // math.prod(sizes.values())))
     mesh = sharding.abstract_mesh(**sizes) if sizes else None
+    if args.devices:
+        mesh = sharding.abstract_mesh(*sharding.mesh_sizes(args.devices, **sizes))
     texts = []
     for stage in chosen:
         m = max(stage.views.contexts) if args.context is None else args.context
@@ -238,9 +255,8 @@ def dry_run(args: argparse.Namespace) -> str:
             raise UserError(
                 f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
             )
-        if mesh is not None:
-            loop.check_batch(stage.batch, mesh)
         sized = stage_size(args, stage, cfg)
+        room.check_layout(sized, stage, mesh, fused=dtype == "bfloat16")
         found = estimate.estimate(
             sized, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
         )
@@ -271,7 +287,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     out = args.out / stage.name
     before = start.provenance(base)
     say = print if distributed.is_main() else (lambda *_: None)
-    dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+    dtype = start.kept_dtype(args.frozen_dtype)
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
     told = []
     if distributed.is_main():
@@ -294,8 +310,6 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
             return checkpoint.load_model(out / "model")
     for line in told:
         say(line)
-    if mesh is not None:
-        loop.check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
     working = stages.stage_config(cfg, stage)
     size = working.height, working.width

@@ -102,6 +102,19 @@ def pool_fingerprint(pool: Path) -> str:
     return fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
 
 
+def find_devices(count: int | None) -> list[jax.Device]:
+    """The first `count` devices, None: all. Raises UserError if there are fewer."""
+    found = jax.devices()
+    if count is not None and count > len(found):
+        raise UserError(f"--devices {count}: {len(found)} are here; give at most so many.")
+    return found[:count]
+
+
+def kept_dtype(given: str | None) -> str:
+    """What frozen matrices are kept in: --frozen-dtype, or what suits the devices."""
+    return given or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+
+
 def provenance(start: str) -> dict[str, Any]:
     """Where the model to start from comes from, as its own config.json says; {} for 'scratch'."""
     return {} if start == "scratch" else load_provenance(find_model(start))

@@ -21,7 +21,7 @@ import numpy as np
 from ..config import RoGeConfig, VAEConfig, to_dict
 from ..core.params import Spec, flatten, init, unflatten
 from ..errors import UserError
-from ..folders import put
+from ..folders import check_disk, put
 from ..video.dit import FLOAT32_LEAVES
 from ..video.vae_training import passthrough_init
 from .mapping import Entry, source_shapes
@@ -217,7 +217,7 @@ def write(
     done = _resumable(part, record) if resume else 0
     if not done:
         shutil.rmtree(part, ignore_errors=True)
-    check_disk(part, sum(layout.sizes))
+    check_disk(sum(layout.sizes), part, held=[part])
     part.mkdir(parents=True, exist_ok=True)
     if not done:
         (part / PLAN).write_text(json.dumps(record))
@@ -314,17 +314,3 @@ def check_output(out: Path) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out} exists already: give a new folder, or remove that one first.")
     return out.with_name(out.name + ".part")
-
-
-def check_disk(part: Path, needed: int) -> None:
-    """Raise UserError unless the disk has room for `needed` bytes beside what `part` holds already."""
-    place = part
-    while not place.exists():
-        place = place.parent
-    have = sum(f.stat().st_blocks * 512 for f in part.glob("*.safetensors")) if part.exists() else 0
-    free = shutil.disk_usage(place).free
-    if needed - have > free:
-        raise UserError(
-            f"The model needs {needed / 1e9:.2f} GB at {place.resolve()}, where {free / 1e9:.2f} GB are free: "
-            "make room or give another --out."
-        )
