@@ -154,6 +154,12 @@ def model_fingerprint(params: Tree, config: RoGeConfig) -> str:
     return fingerprint(leaves, json.dumps(to_dict(config), sort_keys=True))
 
 
+def weights_fingerprint(params: Tree, dtype: Any = None) -> str:
+    """`folders.fingerprint` of the weights alone, whatever the size of the video; leaves may be in files, mapped."""
+    leaves = flatten(params).items()
+    return fingerprint(((path, np.asarray(leaf)) for path, leaf in leaves), dtype=dtype)
+
+
 def find_model(name: str | Path) -> Path:
     """The folder of a model: a path, or the name of a shipped one."""
     folder = Path(name)

@@ -380,9 +380,17 @@ def dry_run(args: argparse.Namespace, settings) -> str:
 
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
     settings, notes = settings.of(config), []
+    dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
-        sharding.shardings(model.specs(config), mesh)
-        notes.append(f"note: FLOPs and memory are those of all {mesh.size} devices together")
+        if dtype == "bfloat16":
+            sharding.check_heads(config.dit.heads, mesh)
+        kept = sharding.held(
+            model.specs(config), mesh, lambda path: "float32" if cost.keeps_float32(path) else dtype
+        )
+        notes.append(
+            f"note: each device holds {cost.scaled(kept, 'B')} of weights; FLOPs and working memory are those of all "
+            f"{mesh.size} devices together"
+        )
     scene = stand_in(args, config)
     _, photos, path = read_inputs(args, config, settings, scene)
     if scene is not None:
@@ -408,7 +416,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         count,
         frames=len(path),
         later=sum(sampling.chained(m, config)) if settings.long == "chain" else m,
-        half=large_dtype(args, sum(cost.weight_bytes(config).values()) / 4) == "bfloat16",
+        half=dtype == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
     return "\n".join([text, *notes])

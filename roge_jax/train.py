@@ -286,6 +286,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
 
     out = args.out / stage.name
     before = start.provenance(base)
+    origin = checkpoint.weights_fingerprint(params) if stage.lora else ""
     say = print if distributed.is_main() else (lambda *_: None)
     dtype = start.kept_dtype(args.frozen_dtype)
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
@@ -404,7 +405,8 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
             out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
         )
         if stage.lora:
-            provenance |= {"data": str(args.data or "procedural scenes")}
+            data = str(args.data or "procedural scenes")
+            provenance |= {"data": data, "base_weights": origin}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
         print(f"{stage.name}: saved {out / 'model'}{change}")

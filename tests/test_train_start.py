@@ -48,6 +48,9 @@ def test_licences_of_published_weights_reach_every_adapter_and_model(cheap, tmp_
         assert load_provenance(out / "lora" / kind)["base_provenance"] == load_provenance(base)
     words = [out / "lora/adapter", "--merge", base, "--out", merged]
     export.main(parse(export.parser(), [str(word) for word in words]))
+    with pytest.raises(UserError, match="has other weights than the model"):
+        words = [out / "lora/adapter", "--merge", out / "lora/model", "--out", tmp_path / "twice"]
+        export.main(parse(export.parser(), [str(word) for word in words]))
     cards = [(out / "lora/adapter/README.md").read_text()]
     for start in (out / "lora/model", merged):  # and of what is trained on top of that
         cards.append(adapter_card({}, SMALL, {"base_provenance": provenance(str(start))}))

@@ -231,6 +231,16 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def held(specs: Tree, mesh: AnyMesh, dtype: Callable[[str], Any] | None = None) -> int:
+    """Bytes of a spec tree on each device, every leaf in `dtype(path)` or its spec's own."""
+    where = flatten(shardings(specs, mesh))
+    return sum(
+        math.prod(where[path].shard_shape(spec.shape))
+        * jnp.dtype(spec.dtype if dtype is None else dtype(path)).itemsize
+        for path, spec in flatten(specs).items()
+    )
+
+
 def describe(specs: Tree, mesh: AnyMesh, dtype: Callable[[str], Any] | None = None) -> str:
     """A table, one line per leaf: path, shape, PartitionSpec, bytes on each device; then the sums.
 

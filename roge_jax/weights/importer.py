@@ -233,15 +233,18 @@ def write(
     put(part, out)
 
 
-def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray]]]:
-    """(leaf, layer, its value) in the order of writing, the same in every run."""
+def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray], str]]:
+    """(leaf, layer, its value, where that is from) in the order of writing, the same in every run."""
 
     def filled(fill: Fill):
         return lambda: fill.make(fill.source.read(fill.key))
 
-    pieces = [(fill.path, fill.layer, filled(fill)) for fill in plan.fills]
-    pieces += [(path, None, lambda v=value: v) for path, value in plan.given.items()]
-    return pieces + [(p, None, lambda p=p: initial_leaf(p, plan)) for p in plan.initialised]
+    pieces = [
+        (fill.path, fill.layer, filled(fill), f"{fill.source.path}: {fill.key}")
+        for fill in plan.fills
+    ]
+    pieces += [(path, None, lambda v=value: v, path) for path, value in plan.given.items()]
+    return pieces + [(p, None, lambda p=p: initial_leaf(p, plan), p) for p in plan.initialised]
 
 
 def _write_pieces(plan: Plan, part: Path, layout: Layout, done: int, progress) -> None:
@@ -249,12 +252,17 @@ def _write_pieces(plan: Plan, part: Path, layout: Layout, done: int, progress) -
     written = pending = 0
     total = sum(layout.sizes)
     try:
-        for i, (path, layer, value) in enumerate(_pieces(plan)):
+        for i, (path, layer, value, origin) in enumerate(_pieces(plan)):
             shape = plan.specs[path].shape if layer is None else plan.specs[path].shape[1:]
             size = int(np.prod(shape)) * plan.dtype(path).itemsize
             written += size
             if i >= done:
-                shards.write(path, value(), layer)
+                try:
+                    shards.write(path, value(), layer)
+                except FloatingPointError:
+                    raise UserError(
+                        f"{origin} holds NaN or infinity, or values beyond {plan.dtype(path)}: get the file again."
+                    ) from None
                 pending += size
                 if pending >= FLUSH_BYTES:
                     _note(part, shards, i + 1)
