@@ -206,11 +206,16 @@ def sampling_mesh(args: argparse.Namespace):
 
 def load_weights(args: argparse.Namespace, mesh=None):
     """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+    import jax
+
     from . import checkpoint, cost, model
     from .core import sharding
     from .core.params import count
 
-    specs = model.specs(checkpoint.load_config(checkpoint.find_model(args.checkpoint)))
+    config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
+    specs = model.specs(config)
+    if jax.default_backend() == "gpu":
+        sharding.check_heads(config.dit.heads, mesh)
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(
         args.checkpoint,
@@ -222,30 +227,15 @@ def load_weights(args: argparse.Namespace, mesh=None):
 # ---- outputs -------------------------------------------------------------------------------------
 
 
-def transforms(names: list[str], cameras, height: int, width: int) -> dict[str, Any]:
-    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
-    from .geometry.cameras import opencv_to_opengl
-
-    frames = []
-    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {
-            "file_path": f"frames/{name}",
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
-        }
-        frames.append(entry | {"transform_matrix": pose})
-    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
-
-
 def write_outputs(folder: Path, result, photos, fps: float) -> None:
     """All files but run.json."""
     from . import video_io
 
     height, width = result.frames.shape[1:3]
     names = video_io.write_frames(folder / "frames", result.frames)
-    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
+    write_json(
+        folder / "transforms.json", video_io.transforms(names, result.cameras, height, width)
+    )
     video_io.write_video(folder / "video.mp4", result.frames, fps)
     video_io.write_video(folder / "preview.mp4", result.preview, fps)
     rows = {
@@ -374,7 +364,7 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
 
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
-    from . import cost, model, sampling
+    from . import cost, sampling
     from .core import sharding
     from .video import solvers
 
@@ -384,9 +374,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     if mesh is not None:
         if dtype == "bfloat16":
             sharding.check_heads(config.dit.heads, mesh)
-        kept = sharding.held(
-            model.specs(config), mesh, lambda path: "float32" if cost.keeps_float32(path) else dtype
-        )
+        kept = cost.held_weights(config, mesh, dtype)
         notes.append(
             f"note: each device holds {cost.scaled(kept, 'B')} of weights; FLOPs and working memory are those of all "
             f"{mesh.size} devices together"
