@@ -143,12 +143,11 @@ def main(args: argparse.Namespace) -> None:
 
     cfg = preset if init == "scratch" else checkpoint.load_config(checkpoint.find_model(init))
     check_preset(preset, cfg, init)
-    found = cfg
     cfg, chosen = choose(args, cfg)
     check(args, cfg, chosen, mesh)  # now, not after hours
     with start.on_host():
         if init == "scratch":
-            params = model.init(jax.random.key(args.seed), found)
+            params = model.init(jax.random.key(args.seed), preset)
         else:
             params, _ = checkpoint.load_model(init)
     for stage in chosen:

@@ -22,6 +22,7 @@ from .stages import Stage, stage_specs
 GB = 1e9
 # Estimating activations takes seconds to minutes: not done for a model that takes less than this share of the memory.
 SMALL = 0.05
+_HOST = "of memory, of which there are"
 
 
 def check_layout(
@@ -74,9 +75,6 @@ def check_room(
         f"{name} is estimated to take {taken / GB:,.3g} GB {where} {room / GB:,.3g} GB, most activations in "
         f"{found.fullest}: if it fails, use more devices, --remat full or a smaller --batch (see --dry-run)"
     )
-
-
-_HOST = "of memory, of which there are"
 
 
 def _refuse(name: str, least: float, where: str, most: float | None, cure: str) -> None:
