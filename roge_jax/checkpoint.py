@@ -154,6 +154,12 @@ def model_fingerprint(params: Tree, config: RoGeConfig) -> str:
     return fingerprint(leaves, json.dumps(to_dict(config), sort_keys=True))
 
 
+def weights_fingerprint(params: Tree, dtype: Any = None) -> str:
+    """`folders.fingerprint` of the weights alone, whatever the size of the video; leaves may be in files, mapped."""
+    leaves = flatten(params).items()
+    return fingerprint(((path, np.asarray(leaf)) for path, leaf in leaves), dtype=dtype)
+
+
 def find_model(name: str | Path) -> Path:
     """The folder of a model: a path, or the name of a shipped one."""
     folder = Path(name)
@@ -321,6 +327,13 @@ def _factor_fits(leaf: str, shape: tuple, other: tuple, kernel: Spec) -> bool:
     a, b = (shape, other) if leaf == "lora_a" else (other, shape)
     head, rank = kernel.shape[:lead], a[-1]
     return a == (*head, int(np.prod(ins)), rank) and b == (*head, rank, d_out)
+
+
+def load_provenance(folder: Path) -> dict[str, Any]:
+    """What the config.json of a model or adapter folder says of its origin; {} if nothing."""
+    record = read_json(Path(folder) / "config.json", "model config")
+    found = record.get("provenance") if isinstance(record, dict) else None
+    return found if isinstance(found, dict) else {}
 
 
 def load_config(folder: Path) -> RoGeConfig:

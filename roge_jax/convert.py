@@ -88,6 +88,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: argparse.Namespace) -> None:
     """Convert, or print what would be done. Raises: UserError with all mismatches, before anything is written."""
     from .errors import UserError
+    from .folders import check_disk
     from .weights import importer
 
     if args.out is None and not args.dry_run:
@@ -100,7 +101,8 @@ def main(args: argparse.Namespace) -> None:
     layout = plan.layout(1e9 * args.shard_gb)
     print(summary(plan, filled, layout))
     if args.out is not None:
-        importer.check_disk(args.out.with_name(args.out.name + ".part"), sum(layout.sizes))
+        part = importer.check_output(args.out)
+        check_disk(sum(layout.sizes), part, held=[part])
     if args.dry_run:
         return
     from tqdm import tqdm
@@ -131,11 +133,13 @@ def main(args: argparse.Namespace) -> None:
 
 def make_plan(args: argparse.Namespace):
     """(plan, what each file does), from headers alone but for the prompt. Raises: UserError with all mismatches."""
+    import numpy as np
+
     from .core.params import flatten
     from .errors import UserError
     from .model import specs
     from .weights import importer, published
-    from .weights.prompt import encode_prompt, read_prompt
+    from .weights.prompt import check_encoder, encode_prompt, read_prompt
     from .weights.sources import open_source
 
     filled: list[Any] = []
@@ -145,6 +149,15 @@ def make_plan(args: argparse.Namespace):
         raise UserError(
             "--framecrafter holds changes to a Wan2.1 transformer: give that one with --wan."
         )
+    if args.prompt and not args.t5:
+        raise UserError(
+            f"--prompt '{args.prompt}' needs an encoder to read it: give its folder with --t5, or the finished rows with "
+            "--prompt-embedding alone."
+        )
+    if args.t5 and args.prompt_embedding:
+        raise UserError("--t5 and --prompt-embedding both give the prompt: leave one of them away.")
+    if args.t5:
+        check_encoder(args.t5)
     if args.wan:
         wan, vae_path = published.find_wan(args.wan)
     if args.lagernvs or args.vggt:
@@ -172,10 +185,12 @@ def make_plan(args: argparse.Namespace):
         filled.append(published.fill_recon(config, recon, role))
     importer.report(fault for part in filled for fault in part.faults)
 
-    given = {}
+    given: dict[str, Any] = {}
     if config.dit.text_len and args.prompt_embedding:
         given["prompt/rows"] = read_prompt(args.prompt_embedding, config.dit)
-    elif config.dit.text_len and args.t5 and not args.dry_run:
+    elif config.dit.text_len and args.t5 and args.dry_run:  # in place of what umT5 will say
+        given["prompt/rows"] = np.zeros((config.dit.text_len, config.dit.text_dim), np.float32)
+    elif config.dit.text_len and args.t5:
         given["prompt/rows"] = encode_prompt(args.t5, args.prompt, config.dit)
     elif args.prompt_embedding or (args.t5 and not config.dit.text_len):
         raise UserError(

@@ -6,6 +6,7 @@ matters). Formulas follow the published networks: VGGT and the LagerNVS renderer
 """
 
 import dataclasses
+import functools
 import math
 import re
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 
 from . import model
 from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
+from .core import sharding
 from .core.attention import SCORES_BYTES
 from .core.params import flatten
 from .recon.lookup import ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
@@ -265,6 +267,16 @@ def weight_bytes(config: RoGeConfig, dtype: Any = jnp.float32) -> dict[str, floa
         sizes.setdefault(part, 0.0)
         sizes[part] += math.prod(spec.shape) * size
     return sizes
+
+
+def held_weights(config: RoGeConfig, mesh: sharding.AnyMesh, dtype: str) -> int:
+    """Bytes of weights on each device of a mesh. Raises UserError if it does not divide them."""
+    kept = functools.partial(_stored_as, dtype=dtype)
+    return sharding.held(model.specs(config), mesh, kept)
+
+
+def _stored_as(path: str, dtype: str) -> str:
+    return "float32" if keeps_float32(path) else dtype
 
 
 @dataclasses.dataclass(frozen=True)

@@ -76,7 +76,7 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
     """Write the base with the adapter in it as a model folder, layer by layer.
 
     Kernels get a @ b in float32 and are rounded once to the base's dtype. Raises: UserError if the base has other
-    networks than the adapter was trained on.
+    networks or weights than the model that the adapter was trained on.
     """
     import numpy as np
 
@@ -104,6 +104,12 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
         raise UserError(
             f"{folder} is incomplete: {lost[0]} and {len(lost) - 1} more leaves are missing."
         )
+    trained = checkpoint.load_provenance(adapter)
+    if trained.get("base_weights") not in (None, _weights(source, specs)):
+        raise UserError(
+            f"--merge {base} has other weights than the model that {adapter} was trained on, {trained.get('base')}: give "
+            "that one (a model that training wrote, or a merged one, holds the adapter already)."
+        )
     changed = flatten(tree)
     fills = []
     for path, spec in specs.items():
@@ -118,13 +124,23 @@ def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes
                 importer.Fill(path, i, source, path, functools.partial(_merged, factors, i))
             )
     given = {p: np.asarray(x) for p, x in changed.items() if not p.endswith(("lora_a", "lora_b"))}
-    record = json.loads((folder / "config.json").read_text()).get("provenance", {})
-    trained = json.loads((adapter / "config.json").read_text()).get("provenance", {})
     half = any(t.dtype == DTYPES["BF16"] for t in source.tensors.values())
-    provenance = {"merged": trained, "base": record}
+    provenance = {
+        "merged": trained,
+        "base": checkpoint.load_provenance(folder),
+    }
     plan = importer.Plan(config, specs, fills, given, half, provenance)
     importer.check_coverage(fills, specs)
     importer.write(plan, out, shard_bytes=shard_bytes)
+
+
+def _weights(source, specs) -> str:
+    """`checkpoint.weights_fingerprint` of a model folder as training loads it, in float32."""
+    from . import checkpoint
+    from .core.params import unflatten
+
+    mapped = {path: source.read(path) for path in specs}
+    return checkpoint.weights_fingerprint(unflatten(mapped), dtype="float32")
 
 
 def _merged(factors, layer, kernel):

@@ -88,21 +88,26 @@ def _sync_one(path: Path) -> None:
         os.close(handle)
 
 
-def fingerprint(parts: Iterable[tuple[str, np.ndarray]], more: str = "") -> str:
+def fingerprint(parts: Iterable[tuple[str, np.ndarray]], more: str = "", dtype: Any = None) -> str:
     """Twelve hex digits that tell contents apart: of names, shapes, dtypes and bytes of arrays, and of a text.
 
     Of an array above 1 MiB 16 blocks are read, evenly spaced from the first byte to the last: gigabytes of trained
-    weights take a second, and a change of a few numbers alone may be missed.
+    weights take a second, and a change of a few numbers alone may be missed. With `dtype` it is that of the arrays as
+    they would be in it, of which no more than the blocks are made.
     """
     digest = hashlib.sha256(more.encode())
     for name, x in parts:
-        digest.update(f"\n{name} {x.shape} {x.dtype}\n".encode())
-        flat = np.ascontiguousarray(x).reshape(-1).view(np.uint8)
-        if flat.size <= BLOCKS * BLOCK_BYTES:
-            digest.update(flat.data)
-            continue
-        for start in np.linspace(0, flat.size - BLOCK_BYTES, BLOCKS).astype(np.int64):
-            digest.update(flat[start : start + BLOCK_BYTES].data)
+        kind = np.dtype(x.dtype if dtype is None else dtype)
+        digest.update(f"\n{name} {x.shape} {kind}\n".encode())
+        flat, item = np.ascontiguousarray(x).reshape(-1), kind.itemsize
+        size = flat.size * item
+        starts = [0]
+        if size > BLOCKS * BLOCK_BYTES:
+            starts = np.linspace(0, size - BLOCK_BYTES, BLOCKS).astype(np.int64).tolist()
+        for start in starts:
+            stop = size if len(starts) == 1 else start + BLOCK_BYTES
+            piece = flat[start // item : -(-stop // item)].astype(kind, copy=False).view(np.uint8)
+            digest.update(piece[start % item :][: stop - start].data)
     return digest.hexdigest()[:12]
 
 
@@ -131,6 +136,23 @@ def output_file(file: Path, option: str, *suffixes: str) -> Path:
             f"{option} {_shown(file)} cannot be written ({problem}): give another file."
         )
     return file
+
+
+def check_disk(
+    needed: float, folder: Path, what: str = "The model", held: Iterable[Path] = ()
+) -> None:
+    """Raise UserError unless the disk of `folder` has room for `needed` bytes beside those that `held` have taken."""
+    place = Path(folder)
+    while not place.exists():
+        place = place.parent
+    files = (file for one in held for file in one.rglob("*") if file.is_file())
+    have = sum(512 * getattr(f.stat(), "st_blocks", 0) for f in files)
+    free = shutil.disk_usage(place).free
+    if needed - have > free:
+        raise UserError(
+            f"{what} needs {needed / 1e9:.2f} GB at {place.resolve()}, where {free / 1e9:.2f} GB are free: "
+            "make room or give another --out."
+        )
 
 
 def keep_settings(

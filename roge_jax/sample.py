@@ -206,11 +206,16 @@ def sampling_mesh(args: argparse.Namespace):
 
 def load_weights(args: argparse.Namespace, mesh=None):
     """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+    import jax
+
     from . import checkpoint, cost, model
     from .core import sharding
     from .core.params import count
 
-    specs = model.specs(checkpoint.load_config(checkpoint.find_model(args.checkpoint)))
+    config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
+    specs = model.specs(config)
+    if jax.default_backend() == "gpu":
+        sharding.check_heads(config.dit.heads, mesh)
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(
         args.checkpoint,
@@ -229,7 +234,9 @@ def write_outputs(folder: Path, result, photos, fps: float) -> None:
 
     height, width = result.frames.shape[1:3]
     names = video_io.write_frames(folder / "frames", result.frames)
-    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
+    write_json(
+        folder / "transforms.json", video_io.transforms(names, result.cameras, height, width)
+    )
     video_io.write_video(folder / "video.mp4", result.frames, fps)
     video_io.write_video(folder / "preview.mp4", result.preview, fps)
     rows = {
@@ -362,15 +369,21 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
 
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
-    from . import cost, model, sampling
+    from . import cost, sampling
     from .core import sharding
     from .video import solvers
 
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
     settings, notes = settings.of(config), []
+    dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
-        sharding.shardings(model.specs(config), mesh)
-        notes.append(f"note: FLOPs and memory are those of all {mesh.size} devices together")
+        if dtype == "bfloat16":
+            sharding.check_heads(config.dit.heads, mesh)
+        kept = cost.held_weights(config, mesh, dtype)
+        notes.append(
+            f"note: each device holds {cost.scaled(kept, 'B')} of weights; FLOPs and working memory are those of all "
+            f"{mesh.size} devices together"
+        )
     scene = stand_in(args, config)
     _, photos, path = read_inputs(args, config, settings, scene)
     if scene is not None:
@@ -396,7 +409,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         count,
         frames=len(path),
         later=sum(sampling.chained(m, config)) if settings.long == "chain" else m,
-        half=large_dtype(args, sum(cost.weight_bytes(config).values()) / 4) == "bfloat16",
+        half=dtype == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
     return "\n".join([text, *notes])

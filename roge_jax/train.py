@@ -130,30 +130,48 @@ def main(args: argparse.Namespace) -> None:
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
 
-    distributed.maybe_initialise_distributed()
-    devices = jax.devices()[: args.devices] if args.devices else jax.devices()
-    plain = len(devices) == 1 and not sizes and devices[0].platform == "cpu"
-    mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
+    from . import __version__, checkpoint, config, model
 
-    from . import checkpoint, config
+    distributed.maybe_initialise_distributed()
     from .training import start
 
     preset, init = config.preset(args.preset), starting_point(args)
-    with on_host():
-        if init == "scratch":
-            from . import model
+    start.check_processes(vars(args), init, args.data, version=__version__)
+    devices = start.find_devices(args.devices)
+    plain = len(devices) == 1 and not sizes and devices[0].platform == "cpu"
+    mesh = None if plain else sharding.make_mesh(**sizes, devices=devices)
 
-            params, cfg = model.init(jax.random.key(args.seed), preset), preset
-        else:
-            params, cfg = checkpoint.load_model(init)
+    cfg = preset if init == "scratch" else checkpoint.load_config(checkpoint.find_model(init))
     check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
-    if args.stage == "all" and args.data:
-        for stage in chosen:  # now, not after hours
-            start.open_data(args.data, stage, stage_size(args, stage, cfg))
+    check(args, cfg, chosen, mesh)  # now, not after hours
+    with start.on_host():
+        if init == "scratch":
+            params = model.init(jax.random.key(args.seed), preset)
+        else:
+            params, _ = checkpoint.load_model(init)
     for stage in chosen:
         params, cfg = run_stage(args, stage, params, stage_size(args, stage, cfg), mesh, init)
         init = str(args.out / stage.name / "model")
+
+
+def check(args: argparse.Namespace, cfg, chosen, mesh) -> None:
+    """Raise UserError if a stage does not fit data, mesh, memory or disk; print a line where memory may be short."""
+    import jax
+
+    from .core import distributed
+    from .training import room, start
+
+    dtype, fused = start.kept_dtype(args.frozen_dtype), jax.default_backend() == "gpu"
+    recipe = [(stage, stage_size(args, stage, cfg)) for stage in chosen]
+    for stage, sized in recipe:
+        if args.data:
+            start.open_data(args.data, stage, sized)
+        room.check_layout(sized, stage, mesh, fused=fused)
+    room.check_space(args.out, recipe, save_every=args.save_every)
+    for line in [room.check_room(stage, sized, mesh, dtype=dtype) for stage, sized in recipe]:
+        if line and distributed.is_main():
+            print(line)
 
 
 def starting_point(args: argparse.Namespace) -> str:
@@ -177,11 +195,11 @@ def choose(args: argparse.Namespace, cfg):
     from . import model
     from .core.params import count
     from .errors import UserError
-    from .training import estimate
+    from .training import estimate, start
     from .training import stages as stages_
 
     if args.stage == "hires" or args.size:
-        cfg = resize(cfg, args.size, hires=args.stage == "hires")
+        cfg = start.resize(cfg, args.size, hires=args.stage == "hires")
     side = min(cfg.height, cfg.width)
     recipe = stages_.mini_stages(args.scale, frames=cfg.frames, side=side)
     for hires in (False, True):
@@ -215,7 +233,7 @@ def dry_run(args: argparse.Namespace) -> str:
     from .core import sharding
     from .core.params import count
     from .errors import UserError
-    from .training import estimate, loop
+    from .training import estimate, room
 
     init = starting_point(args)
     cfg = config.preset(args.preset)
@@ -226,9 +244,9 @@ def dry_run(args: argparse.Namespace) -> str:
     large = count(model.specs(cfg)) > estimate.LARGE
     dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
-    if args.devices:
-        sizes.setdefault("data", max(1, args.devices // math.prod(sizes.values())))
     mesh = sharding.abstract_mesh(**sizes) if sizes else None
+    if args.devices:
+        mesh = sharding.abstract_mesh(*sharding.mesh_sizes(args.devices, **sizes))
     texts = []
     for stage in chosen:
         m = max(stage.views.contexts) if args.context is None else args.context
@@ -236,9 +254,8 @@ def dry_run(args: argparse.Namespace) -> str:
             raise UserError(
                 f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
             )
-        if mesh is not None:
-            loop.check_batch(stage.batch, mesh)
         sized = stage_size(args, stage, cfg)
+        room.check_layout(sized, stage, mesh, fused=dtype == "bfloat16")
         found = estimate.estimate(
             sized, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
         )
@@ -248,51 +265,10 @@ def dry_run(args: argparse.Namespace) -> str:
 
 def stage_size(args: argparse.Namespace, stage, cfg):
     """The configuration in a stage: `hires` doubles the size within 'all'; alone, `choose` has set it."""
+    from .training.start import resize
+
     again = args.stage == "all" and stage.name == "hires"
     return resize(cfg, None, hires=True) if again else cfg
-
-
-def resize(cfg, size: str | None, *, hires: bool):
-    """The configuration at another size (None: twice its own); in `hires` the reconstruction keeps its own (Sec. 3.3)."""
-    from .errors import UserError
-
-    if size is None:
-        height, width = 2 * cfg.height, 2 * cfg.width
-    else:
-        try:
-            height, width = (int(x) for x in size.lower().split("x"))
-        except ValueError:
-            raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
-    recon = cfg.recon_height, cfg.recon_width
-    if not hires:
-        recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
-    sizes = {"height": height, "width": width, "recon_height": recon[0], "recon_width": recon[1]}
-    return dataclasses.replace(cfg, **sizes)
-
-
-def on_host():
-    """A context in which new arrays are kept in host memory: a whole model may not fit one accelerator."""
-    import jax
-
-    try:
-        cpu = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:  # JAX_PLATFORMS without cpu
-        return contextlib.nullcontext()
-    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
-
-
-def in_precision(frozen, dtype: str):
-    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
-    from .core.params import flatten, unflatten
-    from .cost import keeps_float32
-
-    with on_host():
-        return unflatten(
-            {
-                path: x if keeps_float32(path) else x.astype(dtype)
-                for path, x in flatten(frozen).items()
-            }
-        )
 
 
 def run_stage(args, stage, params, cfg, mesh, base: str):
@@ -308,8 +284,10 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     from .training import loop, stages, start
 
     out = args.out / stage.name
+    before = start.provenance(base)
+    origin = checkpoint.weights_fingerprint(params) if stage.lora else ""
     say = print if distributed.is_main() else (lambda *_: None)
-    dtype = args.frozen_dtype or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+    dtype = start.kept_dtype(args.frozen_dtype)
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
     told = []
     if distributed.is_main():
@@ -328,12 +306,10 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         )
     if done:
         say(f"{stage.name}: already trained, {out / 'model'}")
-        with on_host():
+        with start.on_host():
             return checkpoint.load_model(out / "model")
     for line in told:
         say(line)
-    if mesh is not None:
-        loop.check_batch(stage.batch, mesh)
     rows = distributed.local_rows(mesh, stage.batch)
     working = stages.stage_config(cfg, stage)
     size = working.height, working.width
@@ -349,7 +325,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
     frozen = stages.read(frozen, stage)
     if dtype != "float32":
-        frozen = in_precision(frozen, dtype)
+        frozen = start.in_precision(frozen, dtype)
     if mesh is not None:  # now, so that no device ever holds all of it twice
         frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
     if args.show_mesh:
@@ -407,7 +383,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    with on_host():
+    with start.on_host():
         params = merge(attach(params, unflatten(full)), unflatten(lora))
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
@@ -420,13 +396,16 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         "stage": stage.name,
         "steps": int(state["step"]),
         "skipped": int(state["skipped"]),
+        "base": base,
+        "base_provenance": before,
     }
     if distributed.is_main():
         checkpoint.save_model(
             out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
         )
         if stage.lora:
-            provenance |= {"base": base, "data": str(args.data or "procedural scenes")}
+            data = str(args.data or "procedural scenes")
+            provenance |= {"data": data, "base_weights": origin}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
         print(f"{stage.name}: saved {out / 'model'}{change}")

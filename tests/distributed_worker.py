@@ -1,10 +1,12 @@
 """One process of the run in test_distributed.py: a linear model trained by the package's own loop.
 
     python distributed_worker.py OUT DATA_WAYS FSDP_WAYS STEPS [--resume] [--die-after STEP]
+    python distributed_worker.py OUT DATA_WAYS FSDP_WAYS disagree
 
 Joins the others through the environment, as any launcher would have it.
 """
 
+import functools
 import os
 import sys
 from pathlib import Path
@@ -81,17 +83,51 @@ def train(
     )
 
 
+def disagree(data: int, fsdp: int) -> None:
+    """Print what is said where processes differ, and fail where they agree and something is said."""
+    import jax
+
+    from roge_jax.core import distributed, sharding
+    from roge_jax.errors import UserError
+    from roge_jax.training.start import check_processes
+
+    mesh, own = sharding.make_mesh(data, fsdp), jax.process_index()
+    rows = distributed.local_rows(mesh, BATCH)
+
+    def batch(photos: int):
+        views = {"views": np.ones((len(rows), photos, 2), np.float32)}
+        return distributed.global_batch(views, mesh, BATCH)["views"]
+
+    assert batch(3).shape == (BATCH, 3, 2)
+    check = functools.partial(check_processes, version="1")
+    check({"seed": 0, "devices": None}, "mini", None)
+    for wrong in (
+        lambda: batch(3 + own),
+        lambda: check({"seed": 0, "out": f"runs/{own}"}, "scratch", None),
+        lambda: check({"seed": 0, "devices": 1}, "scratch", None),
+    ):
+        try:
+            wrong()
+        except UserError as error:
+            print(error, flush=True)
+        else:
+            raise AssertionError("nothing was said")
+
+
 if __name__ == "__main__":
     from roge_jax.core.distributed import maybe_initialise_distributed
 
     out, data, fsdp, steps = sys.argv[1:5]
     options = sys.argv[5:]
     maybe_initialise_distributed()
-    train(
-        Path(out),
-        int(data),
-        int(fsdp),
-        int(steps),
-        resume="--resume" in options,
-        die_after=int(options[-1]) if "--die-after" in options else None,
-    )
+    if steps == "disagree":
+        disagree(int(data), int(fsdp))
+    else:
+        train(
+            Path(out),
+            int(data),
+            int(fsdp),
+            int(steps),
+            resume="--resume" in options,
+            die_after=int(options[-1]) if "--die-after" in options else None,
+        )

@@ -581,6 +581,51 @@ def test_prompt_embedding_of_wrong_shape(files, tmp_path, shape):
     fails("prompt embedding of shape", *everything(files)[:-1], tmp_path / "p.npy")
 
 
+def t5_folder(folder: Path, without: str = "") -> Path:
+    """A diffusers folder that looks like umT5, of which nothing can be read."""
+    parts = {
+        "text_encoder/config.json": '{"model_type": "umt5"}',
+        "text_encoder/model.safetensors": "",
+        "tokenizer/tokenizer.json": "{}",
+    }
+    for name, content in parts.items():
+        if name != without:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(content)
+    return folder
+
+
+def test_options_of_the_prompt_that_would_be_ignored(files, tmp_path, capsys):
+    plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
+    fails("--prompt 'a cat' needs an encoder", *plain, "--prompt", "a cat")
+    fails("--prompt 'a cat' needs an encoder", *everything(files), "--prompt", "a cat")
+    fails("both give the prompt: leave one", *everything(files), "--t5", t5)
+    fails("no umT5 encoder and tokenizer there", *plain, "--t5", tmp_path / "nowhere")
+    for i, lost in enumerate(("config.json", "model.safetensors", "tokenizer.json")):
+        name = f"{'tokenizer' if 'tokenizer' in lost else 'text_encoder'}/{lost}"
+        part = t5_folder(tmp_path / f"{i}", without=name)
+        fails("no umT5 encoder and tokenizer there", *plain, "--t5", part)
+    (t5 / "text_encoder/config.json").write_text('{"model_type": "bert"}')
+    fails("is of model type bert", *plain, "--t5", t5)
+    capsys.readouterr()
+    run(*plain, "--t5", t5_folder(tmp_path / "good"), "--prompt", "a cat", "--dry-run")
+    assert "no prompt embedding" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("dtype", ["bfloat16", "float32"])
+def test_values_that_are_not_finite_are_named_and_nothing_is_written(files, tmp_path, dtype):
+    for key, value in (("blocks.1.ffn.0.weight", np.nan), ("blocks.2.norm3.bias", -np.inf)):
+        tensors = made.dit_tensors()[1]
+        tensors[key] = np.array(tensors[key])
+        tensors[key].flat[-1] = value
+        made.save(tmp_path / "wan/bad.safetensors", tensors)
+        given = ["--wan", tmp_path / "wan/bad.safetensors", "--preset", files["config"]]
+        given += ["--random", "vae", "encoder", "renderer", "--dtype", dtype]
+        with pytest.raises(UserError, match=rf"bad\.safetensors: {key} holds NaN or infinity"):
+            run(*given, "--out", tmp_path / "m")
+    assert [p.name for p in tmp_path.iterdir()] == ["wan"]
+
+
 # ---- interruption --------------------------------------------------------------------------------
 
 

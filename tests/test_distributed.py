@@ -19,6 +19,23 @@ from roge_jax.errors import UserError
 WORKER = Path(distributed_worker.__file__)
 
 
+def joined(index: int, count: int, port: int, devices: int) -> dict[str, str]:
+    """The environment of process `index` of `count`."""
+    return os.environ | {
+        "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}",
+        "JAX_NUM_PROCESSES": str(count),
+        "JAX_PROCESS_ID": str(index),
+        "XLA_FLAGS": spelled(FLAGS | {DEVICES: str(devices)}),
+        "PYTHONPATH": str(WORKER.parent.parent),
+    }
+
+
+def free_port() -> int:
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
 def start(
     out: Path,
     count: int,
@@ -27,21 +44,13 @@ def start(
     *options: str,
     lost: int | None = None,
     after: int = 0,
+    steps: str = "6",
 ):
     """`count` processes that share data * fsdp CPU devices; process `lost` vanishes after step `after`."""
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        port = s.getsockname()[1]
-    processes = []
+    port, processes = free_port(), []
     for index in range(count):
-        environment = os.environ | {
-            "JAX_COORDINATOR_ADDRESS": f"127.0.0.1:{port}",
-            "JAX_NUM_PROCESSES": str(count),
-            "JAX_PROCESS_ID": str(index),
-            "XLA_FLAGS": spelled(FLAGS | {DEVICES: str(data * fsdp // count)}),
-            "PYTHONPATH": str(WORKER.parent.parent),
-        }
-        command = [sys.executable, str(WORKER), str(out), str(data), str(fsdp), "6", *options]
+        environment = joined(index, count, port, data * fsdp // count)
+        command = [sys.executable, str(WORKER), str(out), str(data), str(fsdp), steps, *options]
         command += ["--die-after", str(after)] if index == lost else []
         with (out.parent / f"{out.name}.{index}.txt").open("a") as log:
             processes.append(subprocess.Popen(command, env=environment, stdout=log, stderr=log))
@@ -90,6 +99,45 @@ def test_lost_process(tmp_path, count, data, fsdp):
     assert sorted(found) == sorted(expected), "no step is missing or logged twice"
     # float32 sums over devices in another order: a few units in the last place per step
     np.testing.assert_allclose([found[i] for i in expected], list(expected.values()), rtol=2e-6)
+
+
+def test_processes_that_differ_say_so_instead_of_computing(tmp_path):
+    out = tmp_path / "differ"
+    assert wait(start(out, 2, 2, 1, steps="disagree"), out) == [0, 0], text(out, 2)
+    for index in range(2):
+        said = (tmp_path / f"differ.{index}.txt").read_text()
+        for words in (
+            "Process 1 has views float32[4, 2], and process 0 has float32[3, 2]",
+            "Process 1 has --out runs/1, and process 0 has runs/0: start every process with the same",
+            "--devices 1 is for one process, and 2 are running",
+        ):
+            assert words in said, said
+
+
+@pytest.mark.slow  # each process compiles a step of `tiny`
+def test_the_program_in_two_processes(tmp_path):
+    """`python -m roge_jax.train` as launchers start it: the losses of one process, and exit code 2 where they differ."""
+
+    def run(out: Path, count: int, *odd: str) -> list[int]:
+        port, processes = free_port(), []
+        for index in range(count):
+            words = ["tiny", "--steps", "2", "--batch", "2", "--log-every", "1", "--out", str(out)]
+            words += odd if index == 1 else []
+            with (tmp_path / f"{out.name}.{index}.txt").open("w") as log:
+                command = [sys.executable, "-m", "roge_jax.train", *words]
+                environment = joined(index, count, port, 1)
+                processes.append(subprocess.Popen(command, env=environment, stdout=log, stderr=log))
+        return wait(processes, out, 900.0)
+
+    assert run(tmp_path / "one", 1) == [0], text(tmp_path / "one", 1)
+    assert run(tmp_path / "two", 2) == [0, 0], text(tmp_path / "two", 2)
+    one, two = (losses(tmp_path / name / "lora") for name in ("one", "two"))
+    assert sorted(one) == [1, 2]
+    np.testing.assert_allclose([two[i] for i in one], list(one.values()), rtol=1e-5)
+    assert (tmp_path / "two/lora/adapter/README.md").exists()
+    assert run(tmp_path / "odd", 2, "--seed", "1") == [2, 2], text(tmp_path / "odd", 2)
+    assert "Process 1 has --seed 1, and process 0 has 0" in text(tmp_path / "odd", 2)
+    assert not (tmp_path / "odd").exists()
 
 
 class TestLaunchArguments:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from published_files import CONFIG, random_tree
 
-from roge_jax import checkpoint, export, model
+from roge_jax import checkpoint, export, folders, model
 from roge_jax.config import LoraConfig
 from roge_jax.core import lora, params
 from roge_jax.entry import parse
@@ -106,6 +106,22 @@ def test_merged_model_stands_alone(base, adapter, tmp_path, dtype):
     assert changed.max() > 0.05  # the comparison is not of two unmerged models
     provenance = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
     assert provenance["merged"]["steps"] == 20
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_an_adapter_is_merged_into_its_own_base_and_once(
+    base, adapter, tmp_path, dtype, monkeypatch
+):
+    monkeypatch.setattr(folders, "BLOCK_BYTES", 96)  # so that large leaves are read in blocks
+    monkeypatch.setattr(folders, "BLOCKS", 5)
+    checkpoint.save_model(tmp_path / "base", base, SMALL, dtype=dtype)
+    loaded, _ = checkpoint.load_model(tmp_path / "base")
+    record = {"base": "weights/test", "base_weights": checkpoint.weights_fingerprint(loaded)}
+    checkpoint.save_adapter(tmp_path / "a", adapter, SMALL, record)
+    run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "once")
+    with pytest.raises(UserError, match=r"other weights than .* weights/test: give that one"):
+        run(tmp_path / "a", "--merge", tmp_path / "once", "--out", tmp_path / "twice")
+    assert not list(tmp_path.glob("twice*"))
 
 
 @pytest.mark.parametrize("style", export.STYLES)

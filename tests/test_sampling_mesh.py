@@ -1,6 +1,8 @@
 """One video on many devices is the video of one device; weights go from the file straight to where they lie."""
 
 import dataclasses
+import math
+import re
 import tracemalloc
 
 import jax
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 from test_sharding import drawn, small
 
-from roge_jax import model, sample, sampling
+from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.checkpoint import find_model, load_config, load_model, save_model
 from roge_jax.core import sharding
 from roge_jax.core.params import abstract, flatten
@@ -113,3 +115,28 @@ class TestFlags:
             self.mesh("--mesh", "data=2,seq=2")
         with pytest.raises(UserError, match="does not make 4 devices"):
             self.mesh("--mesh", "fsdp=3", "--devices", "4")
+
+    def test_the_dry_run_tells_what_each_device_holds(self, capsys):
+        def note(*words):
+            arguments = ["--dry-run", "--dtype", "bfloat16", *words]
+            assert entry.execute(sample.main, sample.parser(), arguments) in (0, None)
+            found = re.search(r"each device holds ([0-9.]+) MB", capsys.readouterr().out)
+            return float(found[1])
+
+        cfg = load_config(find_model("mini"))
+        for words, ways in (("fsdp=2,seq=2", 2), ("seq=2", 1)):
+            held = 0.0
+            for path, spec in flatten(model.specs(cfg)).items():
+                item = 4 if cost.keeps_float32(path) else 2
+                held += math.prod(spec.shape) * item / (ways if "embed" in spec.axes else 1)
+            assert note("--mesh", words) == pytest.approx(held / 1e6, rel=0.01)
+        words = ["--dry-run", "--checkpoint", "paper", "--dtype", "bfloat16", "--mesh", "seq=3"]
+        assert entry.execute(sample.main, sample.parser(), words) == 2
+        assert "seq=3 does not divide 40 attention heads" in capsys.readouterr().err
+
+    def test_a_gpu_refuses_heads_that_do_not_divide_before_it_loads(self, monkeypatch):
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        monkeypatch.setattr(checkpoint, "load_model", None)
+        with pytest.raises(UserError, match="seq=3 does not divide 4 attention heads"):
+            arguments = sample.parser().parse_args(["--checkpoint", "mini"])
+            sample.load_weights(arguments, sharding.abstract_mesh(seq=3))

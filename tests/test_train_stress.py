@@ -13,7 +13,7 @@ import pytest
 from test_training import OPTIM as LINEAR
 from test_training import SPECS, arrays, assert_same, batch_of, log_of, objective, run, start
 
-from roge_jax import checkpoint, model, train
+from roge_jax import checkpoint, model
 from roge_jax.checkpoint import CHECKSUMS
 from roge_jax.config import preset
 from roge_jax.core import params, sharding
@@ -24,6 +24,7 @@ from roge_jax.errors import UserError
 from roge_jax.folders import keep_settings, output_folder
 from roge_jax.training import diagnose, loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
+from roge_jax.training.start import in_precision
 
 # LoRA over frozen bfloat16 weights, as in the paper's stage: on the reconstruction with its loss, and (slow to compile)
 # on both halves with the joint loss. Cross attention as in `mini`, all views in one chunk.
@@ -70,7 +71,7 @@ def prepared(stage):
     goal = functools.partial(stages.OBJECTIVES[stage.objective], config=CONFIG, stage=stage)
     made = jax.jit(loop.make_step(goal, optimiser, OPTIM))
     state = loop.initial_state(trainable, optimiser, OPTIM)
-    return made, state, train.in_precision(frozen, "bfloat16")
+    return made, state, in_precision(frozen, "bfloat16")
 
 
 def taken(stage, batch):

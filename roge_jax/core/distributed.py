@@ -1,9 +1,12 @@
 """Several processes, one program: joining them, and which scenes of a batch each one has to load.
 
 Every process runs the same program on the same arguments. Weights and noise come from seeds, so they agree; only the
-scenes of a batch differ: a process loads those that its own devices work on (`local_rows`).
+scenes of a batch differ: a process loads those that its own devices work on (`local_rows`). What must agree and could
+differ is compared (`check_same`): arguments and data at the start, the shapes of every batch.
 """
 
+import hashlib
+import json
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -92,6 +95,30 @@ def is_main() -> bool:
     return jax.process_index() == 0
 
 
+def check_same(values: Mapping[str, Any], cure: str) -> None:
+    """Raise the same UserError in every process unless all of them hold equal values (compared as text).
+
+    All processes must call it. `cure` ends the sentence, which names the first value that differs.
+    """
+    if jax.process_count() == 1:
+        return
+    from jax.experimental.multihost_utils import process_allgather
+
+    text = json.dumps({name: str(value) for name, value in values.items()}).encode()
+    digest = np.frombuffer(hashlib.sha256(text).digest(), np.uint8)
+    digests = np.asarray(process_allgather(digest))  # [processes, 32]
+    other = next((i for i, found in enumerate(digests) if (found != digests[0]).any()), None)
+    if other is None:
+        return
+    longest = np.asarray(process_allgather(np.int32(len(text)))).max()
+    texts = np.asarray(process_allgather(np.frombuffer(text.ljust(longest), np.uint8)))
+    first, there = (json.loads(texts[i].tobytes()) for i in (0, other))
+    name = next(n for n in [*first, *there] if first.get(n) != there.get(n))
+    raise UserError(
+        f"Process {other} has {name} {there.get(name)}, and process 0 has {first.get(name)}: {cure}."
+    )
+
+
 def local_rows(mesh: Mesh | None, batch: int) -> np.ndarray:
     """Sorted indices of the scenes of a batch that this process' devices work on. Processes may share scenes."""
     if mesh is None:
@@ -102,7 +129,12 @@ def local_rows(mesh: Mesh | None, batch: int) -> np.ndarray:
 
 
 def global_batch(local: Mapping[str, np.ndarray], mesh: Mesh, batch: int) -> dict[str, jax.Array]:
-    """Arrays [batch, ...] over the mesh from this process' rows [len(local_rows), ...]."""
+    """Arrays [batch, ...] over the mesh from this process' rows [len(local_rows), ...].
+
+    Raises: UserError in every process if they bring scenes of different shapes, which XLA would not notice.
+    """
+    shapes = {name: f"{np.asarray(x).dtype}{list(np.shape(x)[1:])}" for name, x in local.items()}
+    check_same(shapes, "scenes of a batch must have the same number of photos and size everywhere")
     rows, sharding = local_rows(mesh, batch), batch_sharding(mesh, batch)
 
     def leaf(name: str, x) -> jax.Array:

@@ -68,7 +68,18 @@ def make_mesh(
     Raises UserError, naming sizes that fit, if the product is not the number of devices.
     """
     devices = jax.devices() if devices is None else list(devices)
-    n = len(devices)
+    return jax.make_mesh(
+        mesh_sizes(len(devices), data, fsdp, seq),
+        MESH_AXES,
+        axis_types=(AxisType.Auto,) * 3,
+        devices=devices,
+    )
+
+
+def mesh_sizes(
+    n: int, data: int | None = None, fsdp: int = 1, seq: int = 1
+) -> tuple[int, int, int]:
+    """(data, fsdp, seq) of a mesh of n devices. Raises UserError as `make_mesh` does."""
     for name, size in zip(MESH_AXES, (data, fsdp, seq)):
         if size is not None and size < 1:
             raise UserError(f"Mesh axis {name}={size}: sizes are whole numbers of at least 1.")
@@ -79,9 +90,7 @@ def make_mesh(
             f"fsdp={fsdp}, seq={seq}" if data is None else f"data={data}, fsdp={fsdp}, seq={seq}"
         )
         raise UserError(f"A mesh of {given} does not make {n} devices: {_fitting(n, fsdp, seq)}.")
-    return jax.make_mesh(
-        (data, fsdp, seq), MESH_AXES, axis_types=(AxisType.Auto,) * 3, devices=devices
-    )
+    return data, fsdp, seq
 
 
 def abstract_mesh(data: int = 1, fsdp: int = 1, seq: int = 1) -> AbstractMesh:
@@ -222,6 +231,16 @@ def gather(tree: Any) -> Any:
     return jax.tree.map(whole, tree)
 
 
+def held(specs: Tree, mesh: AnyMesh, dtype: Callable[[str], Any] | None = None) -> int:
+    """Bytes of a spec tree on each device, every leaf in `dtype(path)` or its spec's own."""
+    where = flatten(shardings(specs, mesh))
+    return sum(
+        math.prod(where[path].shard_shape(spec.shape))
+        * jnp.dtype(spec.dtype if dtype is None else dtype(path)).itemsize
+        for path, spec in flatten(specs).items()
+    )
+
+
 def describe(specs: Tree, mesh: AnyMesh, dtype: Callable[[str], Any] | None = None) -> str:
     """A table, one line per leaf: path, shape, PartitionSpec, bytes on each device; then the sums.
 
@@ -330,14 +349,20 @@ def by_heads(
     q, k, v = (x.astype(dtype) for x in (q, k, v))
     if q.shape[-2] % ways("seq"):
         if jax.default_backend() == "gpu":
-            fit = ", ".join(map(str, _divisors(q.shape[-2])))
-            raise UserError(
-                f"seq={ways('seq')} does not divide {q.shape[-2]} attention heads: use one of {fit}."
-            )
+            check_heads(q.shape[-2], current())
         whole = (None, None, None)
         return constrain(q, ("tokens", None, None)), constrain(k, whole), constrain(v, whole)
     split = (None, "attention_heads", None)
     return constrain(q, split), constrain(k, split), constrain(v, split)
+
+
+def check_heads(heads: int, mesh: AnyMesh | None) -> None:
+    """Raise UserError unless `seq` divides the attention heads, as the fused attention of GPUs needs it."""
+    if mesh is not None and heads % mesh.shape["seq"]:
+        fit = ", ".join(map(str, _divisors(heads)))
+        raise UserError(
+            f"seq={mesh.shape['seq']} does not divide {heads} attention heads: use one of {fit}."
+        )
 
 
 def over_scenes(f: Callable, *batch):

@@ -91,6 +91,15 @@ def abstract_frozen(specs: Tree, dtype: Any) -> Tree:
     )
 
 
+def abstract_state(config: RoGeConfig, stage: Stage) -> Tree:
+    """Shapes of what a checkpoint of the stage holds."""
+    specs, _ = stage_specs(config, stage)
+    optimiser = make_optimiser(stage.optim, specs, stage.steps)
+    return jax.eval_shape(
+        lambda trained: initial_state(trained, optimiser, stage.optim), abstract(specs)
+    )
+
+
 def abstract_step(
     config: RoGeConfig, stage: Stage, m: int, *, scenes: int, dtype: Any = jnp.float32
 ) -> tuple[Callable, tuple]:
@@ -99,9 +108,7 @@ def abstract_step(
     specs, frozen_specs = stage_specs(config, stage)
     optimiser = make_optimiser(stage.optim, specs, stage.steps)
     objective = functools.partial(OBJECTIVES[stage.objective], config=working, stage=stage)
-    state = jax.eval_shape(
-        lambda trained: initial_state(trained, optimiser, stage.optim), abstract(specs)
-    )
+    state = abstract_state(config, stage)
     key = jax.eval_shape(lambda: jax.random.key(0))
     batch = abstract_batch(working, stage, m, scenes)
     arguments = (state, abstract_frozen(frozen_specs, dtype), batch, key)
@@ -162,20 +169,43 @@ def estimate(
     for held in peak.held:
         name = f"{PARTS.get(part(held.scope), 'the rest')}, {which_pass(held.scope)}"
         by_part[name] = by_part.get(name, 0.0) + held.bytes
-    state, frozen, batch, _ = arguments
+    batch = arguments[2]
     return Estimate(
         tokens=tokens,
         parameters={"trained": count(specs), "frozen": count(frozen_specs) if frozen_specs else 0},
         scenes=scenes,
         work={name: work[name] for name in order if name in work},
         memory={
-            "frozen weights": _held(frozen, frozen_specs, mesh),
-            "trained weights and optimiser": _held(state, specs, mesh, state=True),
+            **_held_all(config, stage, mesh, dtype),
             "batch": _tree_bytes(batch),
             "activations and gradients": peak.bytes,
         },
         fullest=max(by_part, key=by_part.__getitem__, default="nowhere"),
     )
+
+
+def lasting(
+    config: RoGeConfig, stage: Stage, *, mesh: sharding.AnyMesh | None = None, dtype: Any
+) -> dict[str, float]:
+    """Bytes on one device of what every step needs, nothing traced: weights, optimiser and gradients."""
+    specs, _ = stage_specs(config, stage)
+    return _held_all(config, stage, mesh, dtype) | {
+        "gradients": _held(abstract(specs), specs, mesh)
+    }
+
+
+def state_bytes(config: RoGeConfig, stage: Stage) -> float:
+    """Bytes of one checkpoint, which holds whole arrays."""
+    return _tree_bytes(abstract_state(config, stage))
+
+
+def _held_all(config, stage, mesh, dtype) -> dict[str, float]:
+    specs, frozen_specs = stage_specs(config, stage)
+    state, frozen = abstract_state(config, stage), abstract_frozen(frozen_specs, dtype)
+    return {
+        "frozen weights": _held(frozen, frozen_specs, mesh),
+        "trained weights and optimiser": _held(state, specs, mesh, state=True),
+    }
 
 
 @functools.lru_cache(maxsize=4)

@@ -1,10 +1,18 @@
 """What a stage starts from: where its sequences come from, and whether a run that goes on is still the same one."""
 
+import contextlib
+import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from ..checkpoint import model_fingerprint
+import jax
+
+from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
-from ..core.params import Tree
+from ..core import distributed
+from ..core.params import Tree, flatten, unflatten
+from ..cost import keeps_float32
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
@@ -50,7 +58,7 @@ def hold_settings(
         "data contents": "procedural scenes",
     }
     if pool is not None:
-        settings["data contents"] = fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
+        settings["data contents"] = pool_fingerprint(pool)
     notes = {"start": start, "data": str(pool or "procedural scenes"), "steps": stage.steps}
     before = keep_settings(out, settings, begun=begun, resume=resume, notes=notes)
     told = []
@@ -65,3 +73,85 @@ def hold_settings(
             "compared"
         )
     return told
+
+
+def check_processes(
+    options: Mapping[str, Any], start: str, pool: Path | None, *, version: str
+) -> None:
+    """Raise UserError in every process of a run that was not started alike everywhere: options, code, model or data."""
+    if jax.process_count() == 1:
+        return
+    if options.get("devices"):
+        raise UserError(
+            f"--devices {options['devices']} is for one process, and {jax.process_count()} are running: leave it out."
+        )
+    found = {f"--{name.replace('_', '-')}": value for name, value in options.items()}
+    found |= {"roge_jax": version, "JAX": jax.__version__}
+    distributed.check_same(found, "start every process with the same options and versions")
+    contents = {}
+    if start != "scratch":
+        files = find_model(start)
+        contents["a start with contents"] = fingerprint_files(files, "*.safetensors", "config.json")
+    if pool is not None:
+        contents["data with contents"] = pool_fingerprint(pool)
+    distributed.check_same(contents, "every process must see the same files")
+
+
+def pool_fingerprint(pool: Path) -> str:
+    """`folders.fingerprint_files` of a pool."""
+    return fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
+
+
+def find_devices(count: int | None) -> list[jax.Device]:
+    """The first `count` devices, None: all. Raises UserError if there are fewer."""
+    found = jax.devices()
+    if count is not None and count > len(found):
+        raise UserError(f"--devices {count}: {len(found)} are here; give at most so many.")
+    return found[:count]
+
+
+def kept_dtype(given: str | None) -> str:
+    """What frozen matrices are kept in: --frozen-dtype, or what suits the devices."""
+    return given or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+
+
+def provenance(start: str) -> dict[str, Any]:
+    """Where the model to start from comes from, as its own config.json says; {} for 'scratch'."""
+    return {} if start == "scratch" else load_provenance(find_model(start))
+
+
+def resize(cfg: RoGeConfig, size: str | None, *, hires: bool) -> RoGeConfig:
+    """The configuration at another size (None: twice its own); in `hires` the reconstruction keeps its own (Sec. 3.3)."""
+    if size is None:
+        height, width = 2 * cfg.height, 2 * cfg.width
+    else:
+        try:
+            height, width = (int(x) for x in size.lower().split("x"))
+        except ValueError:
+            raise UserError(f"--size '{size}' is not HEIGHTxWIDTH: write it like 96x160.") from None
+    recon = cfg.recon_height, cfg.recon_width
+    if not hires:
+        recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
+    return dataclasses.replace(
+        cfg, height=height, width=width, recon_height=recon[0], recon_width=recon[1]
+    )
+
+
+def on_host() -> contextlib.AbstractContextManager:
+    """A context in which new arrays are kept in host memory: a whole model may not fit one accelerator."""
+    try:
+        cpu = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:  # JAX_PLATFORMS without cpu
+        return contextlib.nullcontext()
+    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
+
+
+def in_precision(frozen: Tree, dtype: str) -> Tree:
+    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
+    with on_host():
+        return unflatten(
+            {
+                path: x if keeps_float32(path) else x.astype(dtype)
+                for path, x in flatten(frozen).items()
+            }
+        )

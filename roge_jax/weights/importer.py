@@ -21,7 +21,7 @@ import numpy as np
 from ..config import RoGeConfig, VAEConfig, to_dict
 from ..core.params import Spec, flatten, init, unflatten
 from ..errors import UserError
-from ..folders import put
+from ..folders import check_disk, put
 from ..video.dit import FLOAT32_LEAVES
 from ..video.vae_training import passthrough_init
 from .mapping import Entry, source_shapes
@@ -217,7 +217,7 @@ def write(
     done = _resumable(part, record) if resume else 0
     if not done:
         shutil.rmtree(part, ignore_errors=True)
-    check_disk(part, sum(layout.sizes))
+    check_disk(sum(layout.sizes), part, held=[part])
     part.mkdir(parents=True, exist_ok=True)
     if not done:
         (part / PLAN).write_text(json.dumps(record))
@@ -233,15 +233,18 @@ def write(
     put(part, out)
 
 
-def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray]]]:
-    """(leaf, layer, its value) in the order of writing, the same in every run."""
+def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray], str]]:
+    """(leaf, layer, its value, where that is from) in the order of writing, the same in every run."""
 
     def filled(fill: Fill):
         return lambda: fill.make(fill.source.read(fill.key))
 
-    pieces = [(fill.path, fill.layer, filled(fill)) for fill in plan.fills]
-    pieces += [(path, None, lambda v=value: v) for path, value in plan.given.items()]
-    return pieces + [(p, None, lambda p=p: initial_leaf(p, plan)) for p in plan.initialised]
+    pieces = [
+        (fill.path, fill.layer, filled(fill), f"{fill.source.path}: {fill.key}")
+        for fill in plan.fills
+    ]
+    pieces += [(path, None, lambda v=value: v, path) for path, value in plan.given.items()]
+    return pieces + [(p, None, lambda p=p: initial_leaf(p, plan), p) for p in plan.initialised]
 
 
 def _write_pieces(plan: Plan, part: Path, layout: Layout, done: int, progress) -> None:
@@ -249,12 +252,17 @@ def _write_pieces(plan: Plan, part: Path, layout: Layout, done: int, progress) -
     written = pending = 0
     total = sum(layout.sizes)
     try:
-        for i, (path, layer, value) in enumerate(_pieces(plan)):
+        for i, (path, layer, value, origin) in enumerate(_pieces(plan)):
             shape = plan.specs[path].shape if layer is None else plan.specs[path].shape[1:]
             size = int(np.prod(shape)) * plan.dtype(path).itemsize
             written += size
             if i >= done:
-                shards.write(path, value(), layer)
+                try:
+                    shards.write(path, value(), layer)
+                except FloatingPointError:
+                    raise UserError(
+                        f"{origin} holds NaN or infinity, or values beyond {plan.dtype(path)}: get the file again."
+                    ) from None
                 pending += size
                 if pending >= FLUSH_BYTES:
                     _note(part, shards, i + 1)
@@ -314,17 +322,3 @@ def check_output(out: Path) -> Path:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise UserError(f"--out {out} exists already: give a new folder, or remove that one first.")
     return out.with_name(out.name + ".part")
-
-
-def check_disk(part: Path, needed: int) -> None:
-    """Raise UserError unless the disk has room for `needed` bytes beside what `part` holds already."""
-    place = part
-    while not place.exists():
-        place = place.parent
-    have = sum(f.stat().st_blocks * 512 for f in part.glob("*.safetensors")) if part.exists() else 0
-    free = shutil.disk_usage(place).free
-    if needed - have > free:
-        raise UserError(
-            f"The model needs {needed / 1e9:.2f} GB at {place.resolve()}, where {free / 1e9:.2f} GB are free: "
-            "make room or give another --out."
-        )

@@ -1,13 +1,15 @@
 """The README.md of an adapter: what it is, how to use it, what it was made from and under which licences.
 
 Entries of `provenance` that are read, all optional: `base` (name of the model it was trained on),
-`base_provenance` (that model's own provenance, as `roge_jax.convert` wrote it), `stage`, `steps`, `data` (one sentence
+`base_provenance` (that model's own provenance, as `roge_jax.convert`, `train` or `export` wrote it), `stage`, `steps`, `data` (one sentence
 on the training data) and `data_license`.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from ..config import RoGeConfig
+
+FREE = "Apache-2.0"
 
 # By the option of roge_jax.convert that read the file: (what it is, licence, where its text is).
 LICENCES = {
@@ -17,8 +19,8 @@ LICENCES = {
         "https://huggingface.co/facebook/lagernvs_general_512",
     ),
     "--vggt": ("VGGT-1B", "the VGGT license", "https://huggingface.co/facebook/VGGT-1B"),
-    "--wan": ("Wan2.1", "Apache-2.0", "https://huggingface.co/Wan-AI"),
-    "--wan-vae": ("Wan2.1 VAE", "Apache-2.0", "https://huggingface.co/Wan-AI"),
+    "--wan": ("Wan2.1", FREE, "https://huggingface.co/Wan-AI"),
+    "--wan-vae": ("Wan2.1 VAE", FREE, "https://huggingface.co/Wan-AI"),
     "--framecrafter": ("FrameCrafter", "ask its authors", "https://github.com/szqwu/FrameCrafter"),
 }
 
@@ -32,7 +34,7 @@ def adapter_card(leaves: Mapping[str, object], config: RoGeConfig, provenance: M
         ranks.setdefault(path.partition("/")[0], set()).add(x.shape[-1])  # type: ignore[attr-defined]
     base = provenance.get("base", "not recorded")
     sources = _sources(provenance)
-    restricted = any("Noncommercial" in text or "VGGT license" in text for text in sources)
+    restricted = any(licence != FREE for licence, _ in sources)
     count = sum(x.size for x in leaves.values())  # type: ignore[attr-defined]
     lines = [
         "---",
@@ -70,18 +72,31 @@ def adapter_card(leaves: Mapping[str, object], config: RoGeConfig, provenance: M
         "",
         "## Licences",
         "An adapter is made from the weights below; their terms go on holding for it and for merged models.",
-        *(f"- {text}" for text in sources),
+        *(f"- {text}" for _, text in sources),
         "",
     ]
     return "\n".join(lines)
 
 
-def _sources(provenance: Mapping) -> list[str]:
-    converted = provenance.get("base_provenance", {}).get("converted", [])
-    read = dict.fromkeys(part["option"] for part in converted if part.get("tensors", 1))
-    if not read:
-        return ["The base's own licence (no published weights are recorded in its config.json)."]
-    return [
-        f"{name}: {licence} ({place})"
-        for name, licence, place in (LICENCES[o] for o in read if o in LICENCES)
-    ]
+def _records(provenance: Mapping) -> Iterator[Mapping]:
+    """A provenance and those of everything that the model was made from."""
+    yield provenance
+    for name in ("base_provenance", "merged", "base"):  # `base` is a name where training wrote it
+        if isinstance(provenance.get(name), Mapping):
+            yield from _records(provenance[name])
+
+
+def _sources(provenance: Mapping) -> list[tuple[str, str]]:
+    """(licence, line of the card) of everything with terms of its own that went into the base."""
+    records = list(_records(provenance))
+    parts = [part for record in records for part in record.get("converted", [])]
+    read = dict.fromkeys(part["option"] for part in parts if part.get("tensors", 1))
+    found = []
+    for option in read:
+        name, licence, place = LICENCES.get(option, (option, "not recorded", "ask its authors"))
+        found.append((licence, f"{name}: {licence} ({place})"))
+    for licence in dict.fromkeys(r["license"] for r in records if "license" in r):
+        found.append((licence, f"The model that training began with: {licence}"))
+    if not found and any(record.get("base") == "scratch" for record in records):
+        found = [(FREE, f"Trained from random weights with code under {FREE}.")]
+    return found or [("", "The base's own licence, which is not recorded in its config.json.")]

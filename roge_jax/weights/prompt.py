@@ -9,6 +9,7 @@ import numpy as np
 
 from ..config import DiTConfig
 from ..errors import UserError
+from ..fields import is_file, read_json
 from .sources import open_source
 
 EXTRA = "pip install -e '.[convert]' in the project's folder"
@@ -51,6 +52,31 @@ def read_prompt(file: Path, cfg: DiTConfig) -> np.ndarray:
     return padded(source.read(key), cfg, str(file))
 
 
+def check_encoder(folder: Path) -> None:
+    """Raise UserError unless `folder` looks like what `encode_prompt` takes; no weight is read."""
+    encoder, tokens = _places(folder)
+    problem, kind = "", None
+    if is_file(encoder / "config.json"):
+        record = read_json(encoder / "config.json", "encoder config")
+        kind = record.get("model_type") if isinstance(record, dict) else None
+    if not is_file(encoder / "config.json"):
+        problem = f"no {encoder / 'config.json'}"
+    elif kind != "umt5":
+        problem = f"{encoder / 'config.json'} is of model type {kind}"
+    elif not [*encoder.glob("*.safetensors"), *encoder.glob("*.bin")]:
+        problem = f"no weights in {encoder}"
+    elif not any(is_file(tokens / name) for name in ("tokenizer.json", "spiece.model")):
+        problem = f"no tokenizer in {tokens}"
+    if problem:
+        raise UserError(f"--t5 {folder}: no umT5 encoder and tokenizer there ({problem}).")
+
+
+def _places(folder: Path) -> tuple[Path, Path]:
+    """(encoder, tokenizer) of a Hugging Face folder."""
+    encoder, tokens = (Path(folder) / name for name in ("text_encoder", "tokenizer"))
+    return (encoder if encoder.is_dir() else folder), (tokens if tokens.is_dir() else folder)
+
+
 def encode_prompt(folder: Path, text: str, cfg: DiTConfig) -> np.ndarray:
     """[text_len, text_dim] of `text` by the umT5 encoder in `folder`, in bfloat16 on the CPU.
 
@@ -62,9 +88,7 @@ def encode_prompt(folder: Path, text: str, cfg: DiTConfig) -> np.ndarray:
         from transformers import AutoTokenizer, UMT5EncoderModel
     except ImportError as error:
         raise UserError(f"--t5 needs transformers and torch ({error}): {EXTRA}.") from None
-    folder = Path(folder)
-    encoder = folder / "text_encoder" if (folder / "text_encoder").is_dir() else folder
-    tokens = folder / "tokenizer" if (folder / "tokenizer").is_dir() else folder
+    encoder, tokens = _places(folder)
     try:
         tokenizer = AutoTokenizer.from_pretrained(str(tokens), local_files_only=True)
         model = UMT5EncoderModel.from_pretrained(

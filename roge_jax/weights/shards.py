@@ -108,7 +108,10 @@ class Shards:
             _disk(error, folder)
 
     def write(self, path: str, value: np.ndarray, layer: int | None = None) -> None:
-        """Write a whole leaf, or one layer of a stacked one, in the leaf's dtype (rounded to nearest even)."""
+        """Write a whole leaf, or one layer of a stacked one, in the leaf's dtype (rounded to nearest even).
+
+        Raises: FloatingPointError at the first block with NaN or infinity.
+        """
         place = self.layout.places[path]
         shape = place.shape if layer is None else place.shape[1:]
         assert value.shape == shape, (path, value.shape, shape)
@@ -120,7 +123,10 @@ class Shards:
             for i in range(0, shape[0], rows):
                 # First cast in the order of the source, then transpose: both copies are of one block alone.
                 block = value[i : i + rows].astype(place.dtype, order="K", copy=False)
-                _write_all(file, _contiguous(block).reshape(-1).view(np.uint8))
+                block = _contiguous(block)
+                if not _finite(block):
+                    raise FloatingPointError(path)
+                _write_all(file, block.reshape(-1).view(np.uint8))
         except OSError as error:
             _disk(error, Path(file.name))
 
@@ -145,6 +151,12 @@ def _contiguous(x: np.ndarray) -> np.ndarray:
         for j in range(0, x.shape[1], TILE):
             y[i : i + TILE, j : j + TILE] = x[i : i + TILE, j : j + TILE]
     return y
+
+
+def _finite(x: np.ndarray) -> bool:
+    if x.dtype.itemsize == 2 and x.dtype != np.float16:  # bfloat16, whose own test is slow
+        return not x.size or bool((x.view(np.uint16) & 0x7F80).max() < 0x7F80)
+    return bool(np.isfinite(x).all())
 
 
 def _write_all(file, data) -> None:

@@ -1,0 +1,119 @@
+"""Whether a run fits its mesh, its memory and its disk: asked before weights are loaded.
+
+Refused is what cannot fit: weights, optimiser and gradients, exactly as many bytes as their shapes say. Activations are
+estimated (`training.estimate`) for models that are large for their device, and where only they are too many a line
+warns.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+from .. import model
+from ..config import RoGeConfig
+from ..core import sharding
+from ..core.params import count
+from ..errors import UserError
+from ..folders import check_disk
+from . import estimate, loop
+from .stages import Stage, stage_specs
+
+GB = 1e9
+# Estimating activations takes seconds to minutes: not done for a model that takes less than this share of the memory.
+SMALL = 0.05
+_HOST = "of memory, of which there are"
+
+
+def check_layout(
+    config: RoGeConfig, stage: Stage, mesh: sharding.AnyMesh | None, *, fused: bool
+) -> None:
+    """Raise UserError unless the mesh divides batch, leaves and, for the `fused` attention of GPUs, heads."""
+    if mesh is None:
+        return
+    loop.check_batch(stage.batch, mesh)
+    for specs in stage_specs(config, stage):
+        sharding.shardings(specs, mesh)
+    if fused and stage.objective in ("prior", "joint"):
+        sharding.check_heads(config.dit.heads, mesh)
+
+
+def check_room(
+    stage: Stage, config: RoGeConfig, mesh: jax.sharding.Mesh | None, *, dtype: str
+) -> str:
+    """A line to print if a step may not fit the memory, else ''. Raises: UserError if it cannot.
+
+    Devices with memory of their own are held against it, and the host against the model that it loads, whole and in
+    float32; CPU devices share the memory of the host with that.
+    """
+    devices = [d for d in (jax.devices() if mesh is None else mesh.devices.flat) if _here(d)]
+    count_here = 1 if mesh is None else len(devices)
+    lasting = estimate.lasting(config, stage, mesh=mesh, dtype=dtype)
+    name = f"Stage {stage.name} of '{config.name}'"
+    loaded = 4.0 * count(model.specs(config))
+    needed, room, own = sum(lasting.values()), _own_memory(devices), True
+    if room is not None:
+        _refuse(name, needed, "on each device, which has", room, "split the weights, --mesh fsdp=N")
+        if dtype != "float32":  # made beside the loaded weights, before any is sent to a device
+            loaded += estimate.lasting(config, stage, dtype=dtype)["frozen weights"]
+        _refuse(name, loaded, _HOST, memory_available(), "close other programs")
+    else:
+        own, room = False, memory_available()
+        # The first device uses the very arrays that were loaded, unless they are cut or rounded.
+        whole = dtype == "float32" and (mesh is None or mesh.shape["fsdp"] == 1)
+        needed = count_here * needed + loaded - whole * lasting["frozen weights"]
+        _refuse(name, needed, _HOST, room, "close other programs")
+    if room is None or needed < SMALL * room:
+        return ""
+    fused = own and dtype != "float32"
+    found = estimate.estimate(config, stage, mesh=mesh, dtype=dtype, fused_attention=fused)
+    taken = found.bytes if own else needed + count_here * (found.bytes - sum(lasting.values()))
+    if taken <= room:
+        return ""
+    where = "on each device, which has" if own else _HOST
+    return (
+        f"{name} is estimated to take {taken / GB:,.3g} GB {where} {room / GB:,.3g} GB, most activations in "
+        f"{found.fullest}: if it fails, use more devices, --remat full or a smaller --batch (see --dry-run)"
+    )
+
+
+def _refuse(name: str, least: float, where: str, most: float | None, cure: str) -> None:
+    if most is not None and least > most:
+        raise UserError(
+            f"{name} needs {least / GB:,.3g} GB {where} {most / GB:,.3g} GB, for weights, optimiser and gradients "
+            f"alone: {cure}, or train a smaller model."
+        )
+
+
+def check_space(
+    out: Path, recipe: Sequence[tuple[Stage, RoGeConfig]], *, save_every: int, keep: int = 3
+) -> None:
+    """Raise UserError unless the disk has room for checkpoints and models of every stage (beside what is there)."""
+    needed = 0.0
+    for stage, config in recipe:
+        specs, _ = stage_specs(config, stage)
+        kept = min(keep, -(-stage.steps // save_every))
+        needed += kept * estimate.state_bytes(config, stage) + 4.0 * count(model.specs(config))
+        needed += 4.0 * count(specs) if stage.lora else 0.0
+    what = "What the run keeps (checkpoints and models)"
+    check_disk(needed, out, what, held=[out / stage.name for stage, _ in recipe])
+
+
+def memory_available() -> float | None:
+    """Bytes that programs can still get on this machine; None where /proc does not tell."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+        return next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))
+    except (OSError, StopIteration):
+        return None
+
+
+def _here(device: jax.Device) -> bool:
+    return device.process_index == jax.process_index()
+
+
+def _own_memory(devices: Sequence[jax.Device]) -> float | None:
+    """The smallest memory of the devices in bytes; None where they do not tell, as those of a CPU."""
+    stats = [device.memory_stats() or {} for device in devices]
+    limits = [float(found["bytes_limit"]) for found in stats if "bytes_limit" in found]
+    return min(limits, default=None)

@@ -1,0 +1,201 @@
+"""What the training program looks at before it begins, and what it writes of the model that it began with."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import jax
+import published_files as made
+import pytest
+from train_runs import run, write_pool
+
+from roge_jax import checkpoint, config, convert, entry, export, folders, model, train
+from roge_jax.checkpoint import load_provenance
+from roge_jax.config import to_dict
+from roge_jax.core import params, sharding
+from roge_jax.entry import parse
+from roge_jax.errors import UserError
+from roge_jax.training import estimate, room, stages
+from roge_jax.training.start import provenance
+from roge_jax.weights.model_card import adapter_card
+
+SMALL = dataclasses.replace(
+    made.CONFIG, height=32, width=48, recon_height=32, recon_width=48, frames=5
+)
+
+
+def converted(folder, *options, recon="lagernvs"):
+    """A small model folder as `roge_jax.convert` makes it of published files."""
+    made.save_sharded(folder / "wan", made.dit_tensors(SMALL.dit)[1])
+    made.save(folder / "wan/Wan2.1_VAE.safetensors", made.vae_tensors(SMALL.vae)[1])
+    tensors = {"lagernvs": made.recon_tensors, "vggt": made.vggt_tensors}[recon](SMALL)[1]
+    made.save(folder / f"{recon}.safetensors", tensors)
+    (folder / "config").mkdir()
+    record = {"format": 1, "config": to_dict(SMALL), "provenance": {}}
+    (folder / "config/config.json").write_text(json.dumps(record))
+    arguments = ["--wan", folder / "wan", f"--{recon}", folder / f"{recon}.safetensors"]
+    arguments += ["--preset", folder / "config", "--out", folder / "model", *options]
+    convert.main(parse(convert.parser(), [str(a) for a in arguments]))
+    return folder / "model"
+
+
+def test_licences_of_published_weights_reach_every_adapter_and_model(cheap, tmp_path):
+    base, out, merged = converted(tmp_path), tmp_path / "out", tmp_path / "merged"
+    pool = write_pool(tmp_path / "pool", (32, 48))
+    given = ["--init", base, "--data", pool, "--steps", 1, "--batch", 1]
+    run("tiny", "--devices", 1, *given, "--out", out)
+    for kind in ("model", "adapter"):
+        assert load_provenance(out / "lora" / kind)["base_provenance"] == load_provenance(base)
+    words = [out / "lora/adapter", "--merge", base, "--out", merged]
+    export.main(parse(export.parser(), [str(word) for word in words]))
+    with pytest.raises(UserError, match="has other weights than the model"):
+        words = [out / "lora/adapter", "--merge", out / "lora/model", "--out", tmp_path / "twice"]
+        export.main(parse(export.parser(), [str(word) for word in words]))
+    cards = [(out / "lora/adapter/README.md").read_text()]
+    for start in (out / "lora/model", merged):  # and of what is trained on top of that
+        cards.append(adapter_card({}, SMALL, {"base_provenance": provenance(str(start))}))
+    for card in cards:
+        assert "license: other" in card and "Licence of the data" in card
+        assert "LagerNVS: FAIR Noncommercial" in card and "Wan2.1 VAE: Apache-2.0" in card
+
+
+def test_an_adapter_of_free_weights_is_free():
+    for start in ("mini", "scratch"):
+        record = {"base": start, "base_provenance": provenance(start)}
+        assert "license: apache-2.0" in adapter_card({}, SMALL, record)
+    assert "license: other" in adapter_card({}, SMALL, {"base": "somewhere"})
+
+
+# What is refused before a weight is loaded, or a file written.
+
+
+def refused(tmp_path, capsys, *words) -> str:
+    arguments = [str(word) for word in (*words, "--out", tmp_path / "out")]
+    assert entry.execute(train.main, train.parser(), arguments) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and not any(tmp_path.iterdir())
+    return said
+
+
+@pytest.fixture
+def nothing_is_loaded(monkeypatch):
+    jax.devices()  # all of them, before a run asks for fewer
+    monkeypatch.setattr(model, "init", None)
+    monkeypatch.setattr(checkpoint, "load_model", None)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["tiny", "--mesh", "data=2", "--devices", 2, "--batch", 3], "batch of 3 cannot be split"),
+        (["tiny", "--mesh", "fsdp=3", "--devices", 3], "cannot be split over fsdp=3"),
+        (["mini", "--stage", "all", "--devices", 8, "--batch", 4], "batch of 4 cannot be split"),
+        (["tiny", "--devices", 9], "--devices 9: 8 are here"),
+    ],
+)
+def test_a_mesh_that_does_not_divide(words, says, nothing_is_loaded, tmp_path, capsys):
+    assert says in refused(tmp_path, capsys, *words)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["tiny", "--devices", "6", "--mesh", "fsdp=4"], "does not make 6 devices"),
+        (["paper", "--mesh", "seq=3"], "seq=3 does not divide 40 attention heads: use one of 1, 2"),
+        (["wan1.3b", "--mesh", "seq=5"], "seq=5 does not divide 12 attention heads"),
+    ],
+)
+def test_the_dry_run_refuses_the_mesh_that_the_run_refuses(words, says, tmp_path, capsys):
+    jax.devices()
+    assert says in refused(tmp_path, capsys, *words, "--dry-run")
+    with pytest.raises(UserError, match=says.partition(":")[0]):
+        sizes = sharding.parse_mesh(words[-1])
+        if "--devices" in words:
+            sharding.make_mesh(**sizes, devices=jax.devices()[:6])
+        sharding.check_heads(config.preset(words[0]).dit.heads, sharding.abstract_mesh(**sizes))
+
+
+def lora(cfg):
+    return stages.lora_stage(10, frames=cfg.frames)
+
+
+class TestRoom:
+    """The published 14B transformer, of which nothing is loaded, against memory and disks that are made up."""
+
+    def test_a_cpu_whose_memory_is_too_small(
+        self, nothing_is_loaded, monkeypatch, tmp_path, capsys
+    ):
+        monkeypatch.setattr(room, "memory_available", lambda: 64e9)
+        monkeypatch.setattr(room, "check_space", lambda *_, **__: None)
+        said = refused(tmp_path, capsys, "paper", "--init", "scratch", "--steps", 1, "--devices", 1)
+        # 17.6e9 parameters of 4 bytes, moments and gradients of what trains
+        assert "Stage lora of 'paper' needs 7" in said and "of which there are 64 GB" in said
+
+    def test_the_least_is_what_the_shapes_say(self, monkeypatch):
+        cfg = config.preset("tiny")
+        trained, _ = stages.stage_specs(cfg, lora(cfg))
+        # On one CPU device: the model, then parameters, two moments and gradients of what trains.
+        found = SimpleNamespace(bytes=1e12, fullest="transformer, backward")
+        monkeypatch.setattr(estimate, "estimate", lambda *_, **__: found)
+        least = 4 * (params.count(model.specs(cfg)) + 4 * params.count(trained))
+        for free, fits in ((1.001 * least, True), (0.999 * least, False)):
+            monkeypatch.setattr(room, "memory_available", lambda free=free: free)
+            if fits:
+                assert "is estimated to take" in room.check_room(
+                    lora(cfg), cfg, None, dtype="float32"
+                )
+            else:
+                with pytest.raises(UserError, match="for weights, optimiser and gradients alone"):
+                    room.check_room(lora(cfg), cfg, None, dtype="float32")
+        monkeypatch.setattr(room, "memory_available", lambda: 1000 * least)
+        monkeypatch.setattr(estimate, "estimate", None)  # a small model starts at once
+        assert room.check_room(lora(cfg), cfg, None, dtype="float32") == ""
+
+    def test_a_gpu_is_asked_for_its_own_memory(self, monkeypatch):
+        cfg, mesh = config.preset("paper"), sharding.make_mesh(1, 2, devices=jax.devices()[:2])
+        monkeypatch.setattr(room, "memory_available", lambda: 200e9)
+        found = SimpleNamespace(bytes=30e9, fullest="transformer, backward")
+        monkeypatch.setattr(estimate, "estimate", lambda *_, **__: found)
+        stage = dataclasses.replace(lora(cfg), batch=2)
+        said = {}
+        for size in (16e9, 24e9, 80e9):
+            monkeypatch.setattr(room, "_own_memory", lambda devices, size=size: size)
+            try:
+                said[size] = room.check_room(stage, cfg, mesh, dtype="bfloat16")
+            except UserError as error:
+                said[size] = str(error)
+        assert "GB on each device, which has 16 GB, for weights" in said[16e9]
+        assert "estimated to take 30 GB on each device, which has 24 GB" in said[24e9]
+        assert said[80e9] == ""
+        monkeypatch.setattr(room, "memory_available", lambda: 64e9)
+        with pytest.raises(UserError, match="of memory, of which there are 64 GB"):
+            room.check_room(stage, cfg, mesh, dtype="bfloat16")
+
+    def test_a_disk_without_room_for_checkpoints(
+        self, nothing_is_loaded, monkeypatch, tmp_path, capsys
+    ):
+        usage = folders.shutil.disk_usage(tmp_path)
+        monkeypatch.setattr(folders.shutil, "disk_usage", lambda _: usage._replace(free=10_000_000))
+        words = ["tiny", "--devices", 1, "--save-every", 1]
+        said = refused(tmp_path, capsys, *words, "--steps", 9)
+        assert "checkpoints and models) needs 0.0" in said and "where 0.01 GB are free" in said
+        cfg = config.preset("tiny")
+        for steps, fits in ((1, True), (3, False)):  # one checkpoint is kept, or three
+            stage = dataclasses.replace(lora(cfg), steps=steps)
+            one = estimate.state_bytes(cfg, stage)
+            model_bytes = 4 * (
+                params.count(model.specs(cfg)) + params.count(stages.stage_specs(cfg, stage)[0])
+            )
+            free = model_bytes + 1.5 * one
+            monkeypatch.setattr(
+                folders.shutil, "disk_usage", lambda _, f=free: usage._replace(free=f)
+            )
+            if fits:
+                room.check_space(tmp_path, [(stage, cfg)], save_every=1)
+            else:
+                with pytest.raises(UserError, match="make room or give another --out"):
+                    room.check_space(tmp_path, [(stage, cfg)], save_every=1)
+
+    def test_linux_tells_its_memory(self):
+        found = room.memory_available()
+        assert found is None or 1e7 < found < 1e14
