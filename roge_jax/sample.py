@@ -234,9 +234,7 @@ def write_outputs(folder: Path, result, photos, fps: float) -> None:
 
     height, width = result.frames.shape[1:3]
     names = video_io.write_frames(folder / "frames", result.frames)
-    write_json(
-        folder / "transforms.json", video_io.transforms(names, result.cameras, height, width)
-    )
+    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
     video_io.write_video(folder / "video.mp4", result.frames, fps)
     video_io.write_video(folder / "preview.mp4", result.preview, fps)
     rows = {

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -220,20 +219,3 @@ def contact_sheet(
             left += picture.shape[1] + gap
         top += line + max(p.shape[0] for p in row) + gap
     return np.asarray(sheet)
-
-
-def transforms(names: list[str], cameras, height: int, width: int) -> dict[str, Any]:
-    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
-    from .geometry.cameras import opencv_to_opengl
-
-    frames = []
-    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {
-            "file_path": f"frames/{name}",
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
-        }
-        frames.append(entry | {"transform_matrix": pose})
-    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
