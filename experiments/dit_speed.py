@@ -1,6 +1,6 @@
 """Speed of the diffusion transformer on one CPU core, against PyTorch, and of the choices inside it.
 
-    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about six minutes)
+    taskset -c 3 python -m experiments.dit_speed            (needs the extra `parity`; about seven minutes)
 
 One process, one thread each, float32, the same weights in both: our `dit` and diffusers' `WanTransformer3DModel`, both
 checked to give the same velocity first. Candidates take turns within a round, so drifts of a shared machine hit all of
