@@ -91,13 +91,9 @@ def encode_all(params: Tree, batches, config: RoGeConfig) -> dict[str, np.ndarra
     return clips | {"known": clips["x0"][:, :CONTEXTS], "seen": clips["x0"][:, :CONTEXTS]}
 
 
-def flow_error(params: Tree, clip, noise, sigma, *, config: RoGeConfig, remat="none") -> jax.Array:
-    """|v - (noise - x0)|^2 on the target slots of one clip.
-
-    `known` are the context latents of the appearance condition, `seen` those that are noised in the context slots.
-    """
-    x0, m = clip["x0"], clip["known"].shape[0]
-    cond = fusion.condition(
+def condition(params: Tree, clip, config: RoGeConfig) -> fusion.Condition:
+    """What the transformer is told of one encoded clip."""
+    return fusion.condition(
         params["fusion"],
         clip["known"],
         clip["rays"],
@@ -105,6 +101,15 @@ def flow_error(params: Tree, clip, noise, sigma, *, config: RoGeConfig, remat="n
         clip.get("preview"),
         config.fusion.preview_std,
     )
+
+
+def flow_error(params: Tree, clip, noise, sigma, *, config: RoGeConfig, remat="none") -> jax.Array:
+    """|v - (noise - x0)|^2 on the target slots of one clip.
+
+    `known` are the context latents of the appearance condition, `seen` those that are noised in the context slots.
+    """
+    x0, m = clip["x0"], clip["known"].shape[0]
+    cond = condition(params, clip, config)
     x = flow.x_sigma(jnp.concatenate([clip["seen"], x0[m:]]), noise, sigma)
     v = model.velocity(params, x, sigma, cond, config=config, contexts=m, remat=remat)
     return jnp.square(v - flow.velocity_target(x0, noise))[m:].mean()

@@ -18,7 +18,7 @@ from roge_jax.training import loop, stages
 from roge_jax.training.optim import make_optimiser
 
 from .common import CONTEXTS, SIGMAS, Clock, heldout, muon_flops
-from .generator import TOLD, encode_all, flow_errors, video_stage
+from .generator import TOLD, condition, encode_all, flow_errors, video_stage
 
 TRAINS = r"^(dit|fusion)/"
 SCENES, DRAWS = 2, 4  # of a step: clips, and noise levels of each
@@ -102,14 +102,7 @@ class Frozen:
 
 def clip_loss(params: Tree, clip, key, *, config: RoGeConfig) -> jax.Array:
     """The stage's flow-matching loss of one encoded clip: `DRAWS` noise levels share one condition."""
-    cond = fusion.condition(
-        params["fusion"],
-        clip["known"],
-        clip["rays"],
-        clip["features"],
-        clip.get("preview"),
-        config.fusion.preview_std,
-    )
+    cond = condition(params, clip, config)
     options = {"config": config, "contexts": CONTEXTS, "remat": "none"}
     return model.mean_flow_matching(params, clip["x0"], cond, key, draws=DRAWS, **options)
 
