@@ -99,6 +99,13 @@ def parser() -> argparse.ArgumentParser:
         type=number(1),
         help="photos per scene that --dry-run counts (default: the most)",
     )
+    p.add_argument(
+        "--encode-once",
+        type=number(1),
+        metavar="N",
+        help="stages whose reconstruction and VAE stay as they are (generator, hires): draw N samples, encode\n"
+        "them once into OUT/STAGE/encoded, and train on those (default: every sample is new)",
+    )
     p.add_argument("--save-every", type=number(1), default=100, help="steps between checkpoints")
     p.add_argument("--log-every", type=number(1), default=10, help="steps between log lines")
     p.add_argument(
@@ -219,6 +226,14 @@ def choose(args: argparse.Namespace, cfg):
     changes = {k: v for k, v in changes.items() if v}
     changes["remat"] = args.remat or estimate.default_remat(cfg)
     chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
+    if args.encode_once:
+        alone = args.stage != "all"
+        chosen = [
+            stages_.once_encoded(s, cfg, args.encode_once)
+            if alone or s.name in ("generator", "hires")
+            else s
+            for s in chosen
+        ]
     if args.lr:
         chosen = [
             dataclasses.replace(s, optim=dataclasses.replace(s.optim, learning_rate=args.lr))
@@ -291,7 +306,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
     told = []
     if distributed.is_main():
-        begun = done or any((out / "checkpoints").glob("[0-9]*"))
+        begun = done or any(any((out / d).glob("*[0-9]*")) for d in ("checkpoints", "encoded"))
         told = start.hold_settings(
             out,
             stage,
@@ -340,6 +355,9 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         f"{stage.batch} scenes at {working.height}x{working.width}, {layout} ({jax.devices()[0].device_kind})"
     )
     objective = functools.partial(stages.OBJECTIVES[stage.objective], config=working, stage=stage)
+    batches, encode = start.samples(
+        stage, source, params, working, args.seed, rows, out / "encoded", resume=args.resume
+    )
     writer = None
     if args.tensorboard and distributed.is_main():
         from tensorboardX import SummaryWriter
@@ -347,7 +365,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         writer = SummaryWriter(str(out / "tensorboard"))
     evaluate = None
     if args.evaluate_every:
-        evaluate = stages.held_out(objective, frozen, stage, working)
+        evaluate = stages.held_out(objective, frozen, stage, working, encode=encode)
     diagnose = None
     if args.diagnose_every and stage.objective == "joint":
         from .training.diagnose import joint_diagnose
@@ -359,7 +377,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
             trainable,
             frozen,
             specs,
-            lambda i: stages.stage_batch(source, stage, working, args.seed, i, rows),
+            batches,
             optim=stage.optim,
             loop=loop.LoopConfig(
                 steps=stage.steps,

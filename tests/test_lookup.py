@@ -114,6 +114,87 @@ def test_the_photos_agree_at_the_true_depth_and_nowhere_else():
     assert np.all(deviation[:, ~np.asarray(n[..., 0] >= 2).any(0)] > 0.3)  # strangers
 
 
+def side_by_side(n: int, apart: float):
+    """K and c2w of n parallel cameras in a row."""
+    K = np.tile(np.array([[40.0, 0, W / 2], [0, 40.0, H / 2], [0, 0, 1]], np.float32), (n, 1, 1))
+    c2w = np.tile(np.eye(4, dtype=np.float32), (n, 1, 1))
+    c2w[:, 0, 3] = apart * np.arange(n)
+    return K, c2w
+
+
+def way_of(seen_by, of, side: int) -> lookup.Motion:
+    """From the one view `of` to photos that are `side` times smaller."""
+    way = lookup.motion(*of, *seen_by)
+    return lookup._in_pixels_of(lookup.Motion(way.turn[0], way.shift[0]), side)
+
+
+def reach_of(seen_by, of, cuts: int = 48) -> float:
+    way = way_of(seen_by, of, lookup.CELL)
+    size = (H // lookup.CELL, W // lookup.CELL)
+    return float(lookup.shared_reach(way, lookup.twins(jnp.asarray(seen_by[1])), size, cuts))
+
+
+def test_the_cuts_end_where_two_photos_no_longer_see_the_same():
+    def nearest(apart):
+        K, c2w = side_by_side(3, apart)
+        photos, view = (K[::2], c2w[::2]), (K[1:2], c2w[1:2])
+        return 1.0 / float(lookup.inverse_depth(jnp.float32(47), 48, reach_of(photos, view)))
+
+    # Of parallel photos 2 b apart, both see a tenth of the view between them up to z = 40 b / (0.45 * 48).
+    for apart in (0.4, 0.8, 1.6):
+        bound = 40.0 * apart / (0.45 * W)
+        assert 0.7 * bound < nearest(apart) <= bound
+    K, c2w = side_by_side(3, 0.4)
+    view = K[1:2], c2w[1:2]
+    assert reach_of((K[:1], c2w[:1]), view) == 1.0  # one photo
+    twice = np.repeat(c2w[:1], 2, 0)
+    assert reach_of((K[:2], twice), view) == 1.0  # two from one place
+    # Both behind the view, both looking ahead: as near as there are cuts.
+    behind = c2w[::2] * np.float32(1.0)
+    behind[:, :3, 3] = [[-0.05, 0, -0.6], [0.05, 0, -0.6]]
+    assert reach_of((K[:2], behind), view) == 1.0
+
+
+def test_a_shorter_axis_asks_the_rays_about_its_own_depths():
+    """One cut that the rays favour is the answer at its depth, however the axis is divided."""
+    p = jax.tree.map(jnp.zeros_like, init(jax.random.key(0), lookup.lookup_specs(D, 8, CUTS)))
+    ch, cw, favoured = H // 4, W // 4, 5
+    prior = 9.0 * jax.nn.one_hot(jnp.full((ch, cw), favoured), CUTS)
+    nothing = jnp.zeros((ch, cw, lookup.WIDTH)), jnp.zeros((ch, cw, 3))
+    around = jnp.zeros((CUTS, ch, cw, lookup.AGREED))
+    maps = jnp.zeros((2, ch, cw, lookup.MATCHED + 3))
+    K, c2w = side_by_side(3, 0.0)
+    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]), lookup.CELL)
+    found = {}
+    for reach in (1.0, 0.6):
+        out = lookup._coarse(p, maps, jnp.eye(2), way, reach, prior, nothing[0], nothing[1], around)
+        found[reach] = np.asarray(lookup.inverse_depth(out[1], CUTS, reach))
+    want = float(lookup.inverse_depth(jnp.float32(favoured), CUTS))
+    np.testing.assert_allclose(found[1.0], want, rtol=1e-3)
+    np.testing.assert_allclose(found[0.6], want, rtol=0.05)
+
+
+def test_cells_learn_from_their_surroundings_and_the_view_where_photos_agree():
+    K, c2w = side_by_side(3, 0.3)
+    depth = 2.0
+    photos = textured_plane(K, c2w, depth)
+    photos[:, :12, :16] = 0.4  # a corner without texture
+    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]), 2)
+    halves, cuts, reach = lookup._cells(jnp.asarray(photos[::2]), 2), 48, 0.5
+    told = np.asarray(lookup._agreement_around(halves, jnp.eye(2), way, jnp.float32(reach), cuts))
+    assert told.shape == (cuts, H // 4, W // 4, lookup.AGREED) and np.isfinite(told).all()
+    inverse = np.asarray(lookup.inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach))
+    right = int(np.abs(inverse - 1 / depth).argmin())
+    near = {right - 1, right, right + 1}
+    own, region, _, view, view_seen = np.moveaxis(told, -1, 0)
+    assert own[:, 5, 6].argmin() in near and region[:, 5, 6].argmin() in near
+    # The corner itself cannot tell; the view can.
+    flat = own[:, 1, 1][own[:, 1, 1] < 0.3]  # where two photos see it
+    assert len(flat) > 8 and np.ptp(flat) < 0.02
+    assert view[:, 1, 1].argmin() in near and np.all(view == view[:, :1, :1])
+    assert np.all((region >= 0) & (view >= 0)) and 0 <= view_seen.min() <= view_seen.max() <= 1
+
+
 def test_the_camera_of_a_photo_gets_that_photo():
     # Any weights: wherever a ray is cut, it is the same pixel.
     photos = RNG.random((1, H, W, 3)).astype(np.float32)

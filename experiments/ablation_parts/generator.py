@@ -13,13 +13,13 @@ from roge_jax.config import RoGeConfig
 from roge_jax.core.lora import attach
 from roge_jax.core.params import Tree
 from roge_jax.geometry.rays import plucker
-from roge_jax.training import loop, stages
+from roge_jax.training import encoded, loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
 from roge_jax.video import flow
 
 from .common import CONTEXTS, SIGMAS, Clock, heldout
 
-# What the transformer is told, by the names of `encoded`; a model without preview has no such entry.
+# What the transformer is told, by the names of `clip_of`; a model without preview has no such entry.
 TOLD = {
     "rays": ("rays",),
     "ray features": ("features",),
@@ -76,17 +76,16 @@ def clean_latents(params: Tree, views: model.Views, *, config: RoGeConfig) -> ja
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def encoded(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
-    """What no noise level changes: latents of all slots, and what the transformer is told."""
-    tokens = model.reconstruct(params, views, config=config)
-    features = model.query_rays(params, tokens, views, config=config)
-    x0 = clean_latents(params, views, config=config)
-    return {"x0": x0} | told(params, views, features, config=config)
+def clip_of(params: Tree, views: model.Views, *, config: RoGeConfig) -> dict[str, jax.Array]:
+    """An encoded sample with the rays in place of the cameras, so that they can be hidden."""
+    clip = encoded.encode(params, views, config=config)
+    rays = plucker(clip.pop("K"), clip.pop("c2w"), config.height, config.width)
+    return clip | {"rays": rays}
 
 
 def encode_all(params: Tree, batches, config: RoGeConfig) -> dict[str, np.ndarray]:
-    """`encoded` of many samples, stacked [s, ...], with the photos' latents as `known` and in the slots `seen`."""
-    rows = [encoded(params, jax.tree.map(lambda x: x[0], b), config=config) for b in batches]
+    """`clip_of` of many samples, stacked [s, ...], with the photos' latents as `known` and in the slots `seen`."""
+    rows = [clip_of(params, jax.tree.map(lambda x: x[0], b), config=config) for b in batches]
     clips = {name: np.stack([np.asarray(r[name]) for r in rows]) for name in rows[0]}
     return clips | {"known": clips["x0"][:, :CONTEXTS], "seen": clips["x0"][:, :CONTEXTS]}
 
@@ -97,7 +96,7 @@ def condition(params: Tree, clip, config: RoGeConfig) -> fusion.Condition:
         params["fusion"],
         clip["known"],
         clip["rays"],
-        clip["features"],
+        jnp.asarray(clip["features"], jnp.float32),
         clip.get("preview"),
         config.fusion.preview_std,
     )

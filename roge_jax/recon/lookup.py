@@ -6,7 +6,8 @@ they belong but blurs them, and what it lost is in the photos. As in plane sweep
 an attention, learned from the photometric term alone, and no depth map, point or other 3D thing leaves this module.
 
 1. Coarse, per cell of 4 x 4 pixels: at each of `RendererConfig.lookup` cuts, how well do features of the photos agree
-   where the cut projects to? Together with what the ray features say, that gives logits over the cuts.
+   where the cut projects to, and how well do their colours agree there, in the region and in the whole view? Together
+   with what the ray features say, that gives logits over the cuts. The cuts end where two photos no longer see the same.
 2. Fine, per pixel: a few cuts about the coarse answer, and the photos' colours there.
 3. Which photo is right (near, agreeing with the others and with the RGB head), and whether any is: a mixture of the
    photos' colours and the RGB head's.
@@ -36,6 +37,9 @@ SPACING = 1.5  # exponent: cuts are denser towards infinity
 BLOCKS, WIDTH, MATCHED = 3, 16, 8  # coarse network; channels of the photos' features
 FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
 ALONG = 5  # neighbouring cuts that a coarse block sees
+SHARED = 0.1  # of a view's cells: cuts that two photos see in fewer of them are not looked at
+REGION = 3.0  # standard deviation of a cell's region, in cells
+AGREED = 5  # what a cell is told of the agreement of colours (`_agreement_around`)
 UNSEEN = -8.0  # logit of cuts that no photo sees
 BEHIND = 1e-3  # depths in a photo below this are behind it
 APART = 0.05  # distance in the normalised scene from which photos are witnesses of their own
@@ -66,7 +70,7 @@ def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
         },
         "norm": norm_specs(d, bias=False),
         "prior": linear_specs(d, cells * (cuts + WIDTH), linears, init=zeros),
-        "enter": linear_specs(MATCHED + 3 + 2 + 1 + WIDTH, WIDTH, linears),
+        "enter": linear_specs(MATCHED + 3 + 2 + 1 + WIDTH + AGREED, WIDTH, linears),
         "blocks": stack({"space": conv2d_specs(WIDTH, WIDTH, 3), "along": along}, BLOCKS),
         "score": linear_specs(WIDTH, 1, linears),
         "upsample": linear_specs(2 * WIDTH, 9 * CELL**2, linears, init=zeros),
@@ -101,18 +105,36 @@ def motion(K: jax.Array, c2w: jax.Array, photo_K: jax.Array, photo_c2w: jax.Arra
         return Motion(turn, jnp.einsum("mij,mjk,vmk->vmi", photo_K, inverse, apart))
 
 
-def inverse_depth(cut: jax.Array, cuts: int) -> jax.Array:
-    """1 / depth of a cut, a number between 0 and `cuts` - 1 that need not be whole."""
-    return (jnp.maximum(cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
+def inverse_depth(cut: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> jax.Array:
+    """1 / depth of a cut, a number between 0 and `cuts` - 1 that need not be whole.
 
-
-def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
-    """Values of m images [m, h, w, c] where one view's rays meet their cuts: ([m, k, p, c], seen [m, k, p] 0 or 1).
-
-    `way`: one view's motion in pixels of `images`; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. Bilinear,
-    border repeated; a cut is seen if it lies in front of the photo and inside its frame.
+    The cuts divide the share `reach` of an axis that begins at infinity and ends at `NEAREST`.
     """
-    m, h, w, _ = images.shape
+    return (jnp.maximum(reach * cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
+
+
+def shared_reach(way: Motion, alike: jax.Array, size: tuple[int, int], cuts: int) -> jax.Array:
+    """The share (0, 1] of the axis of `inverse_depth` on which photos from two places see what one view sees.
+
+    `way`: the view's motion in cells of the photos, which have `size` of them. Photos close together, against the depth of the scene, have
+    all of it within a few of the cuts of a whole axis. 1 where no two photos see the same.
+    """
+    numbers = jnp.arange(cuts, dtype=jnp.float32)
+    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, size[0] * size[1]))
+    _, _, seen = meet(way, _pixels(*size, CELL), inverse, size)
+    shared = (witnesses(seen, alike).sum(0) > 1.5).mean(-1) > SHARED
+    last = jnp.max(jnp.where(shared, numbers, -1.0))
+    reach = jnp.minimum(last + 2.0, cuts - 1.0) / (cuts - 1.0)
+    return jax.lax.stop_gradient(jnp.where(last < 0.0, 1.0, reach))
+
+
+def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, int]):
+    """Where one view's rays meet their cuts in m images of `size`: (x, y, seen), each [m, k, p].
+
+    `way`: the view's motion in pixels of the images; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. A cut is
+    seen (1, else 0) if it lies in front of the photo and inside its frame.
+    """
+    h, w = size
     ones = jnp.ones((len(pixels), 1))
     start = jnp.einsum("mij,pj->mpi", way.turn, jnp.concatenate([pixels, ones], -1))
     q = start[:, None] + inverse[None, :, :, None] * way.shift[:, None, None]
@@ -120,6 +142,16 @@ def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array)
     z = jnp.where(front, q[..., 2], 1.0)
     x, y = (jnp.where(front, q[..., i] / z, -1.0) for i in (0, 1))
     seen = front & (x >= 0) & (y >= 0) & (x <= w) & (y <= h)
+    return x, y, seen.astype(jnp.float32)
+
+
+def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
+    """Values of m images [m, h, w, c] where one view's rays meet their cuts: ([m, k, p, c], seen [m, k, p]), as by `meet`.
+
+    Bilinear, border repeated.
+    """
+    m, h, w, _ = images.shape
+    x, y, seen = meet(way, pixels, inverse, (h, w))
     x, y = jnp.clip(x - 0.5, 0.0, w - 1.001), jnp.clip(y - 0.5, 0.0, h - 1.001)
     left, top = jnp.floor(x), jnp.floor(y)
     fx, fy = (x - left)[..., None], (y - top)[..., None]
@@ -130,7 +162,7 @@ def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array)
     index = (top * (w - 1) + left).astype(jnp.int32) + first[:, None, None]
     a, b, c, d = jnp.split(quads.at[index].get(mode="promise_in_bounds"), 4, -1)
     upper, lower = a + fx * (b - a), c + fx * (d - c)
-    return upper + fy * (lower - upper), seen.astype(jnp.float32)
+    return upper + fy * (lower - upper), seen
 
 
 def twins(photo_c2w: jax.Array) -> jax.Array:
@@ -172,10 +204,16 @@ def _pixels(h: int, w: int, step: int) -> jax.Array:
     return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
 
 
-def _cells(images: jax.Array) -> jax.Array:
-    """Means of cells: [v, h, w, 3] -> [v, h / 4, w / 4, 3]."""
+def _cells(images: jax.Array, side: int = CELL) -> jax.Array:
+    """Means of cells: [v, h, w, c] -> [v, h / side, w / side, c]."""
     v, h, w, c = images.shape
-    return images.reshape(v, h // CELL, CELL, w // CELL, CELL, c).mean((2, 4))
+    return images.reshape(v, h // side, side, w // side, side, c).mean((2, 4))
+
+
+def _in_pixels_of(way: Motion, side: int) -> Motion:
+    """`way` in pixels of images that are `side` times smaller."""
+    shrink = jnp.asarray([1 / side, 1 / side, 1.0])
+    return Motion(shrink[None, :, None] * way.turn, shrink[None] * way.shift)
 
 
 @jax.named_scope("look_up")
@@ -197,6 +235,7 @@ def look_up(
     ch = photos.shape[1] // CELL
     way = motion(*cameras, *photo_cameras)
     maps = jnp.concatenate([_features(p["features"], photos), _cells(photos)], -1)
+    halves = _cells(photos, CELL // 2)
     tokens = layer_norm(p["norm"], features.reshape(v, gh * gw, d), eps=EPS)
     tokens = unpatchify(linear(p["prior"], tokens), (gh, gw), ch // gh)
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
@@ -205,14 +244,17 @@ def look_up(
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
+        small = _in_pixels_of(way, CELL)
+        reach = shared_reach(small, alike, maps.shape[1:3], cuts)
+        around = _agreement_around(halves, alike, _in_pixels_of(way, CELL // 2), reach, cuts)
         coarse, cut, sure, hidden = _coarse(
-            p, maps, alike, way, prior, context, _cells(head[None])[0]
+            p, maps, alike, small, reach, prior, context, _cells(head[None])[0], around
         )
         weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
         cut, sure = (_upsampled(weights, x) for x in (cut, sure))
-        found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, cut, head)
+        found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         apart, chord = (x[:, None, None, None] for x in far)
-        far = apart * inverse_depth(cut, cuts)[None, ..., None] + chord
+        far = apart * inverse_depth(cut, cuts, reach)[None, ..., None] + chord
         looked, some, scene = _chosen(p["choose"], found, seen, alike, far, head)
         about = jnp.concatenate([scene, sure[..., None]], -1)
         return Looked(_merged(p["merge"], head, looked, some, about), head, looked, coarse)
@@ -231,21 +273,59 @@ def _features(p: Tree, photos: jax.Array) -> jax.Array:
     return conv2d(p["conv3"], y)
 
 
-def _coarse(p: Tree, maps, alike, way: Motion, prior, context, head):
-    """One view's distribution over the cuts of a cell, from prior [ch, cw, k] and context [ch, cw, c].
+def _agreement_around(halves: jax.Array, alike, way: Motion, reach, cuts: int) -> jax.Array:
+    """How well the colours of photos at half their size [m, 2 ch, 2 cw, 3] agree at one view's cuts [k, ch, cw, 5].
+
+    The deviation in the cell; for its region and for the whole view, the logarithm of the deviation above that of the
+    best cut, and how much of it two photos see. A cell that no two photos see, or without texture, learns from these
+    where its surroundings lie.
+    """
+    _, h, w, _ = halves.shape
+    numbers = jnp.arange(cuts, dtype=jnp.float32)
+    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts, reach)[:, None], (cuts, h * w))
+    values, seen = fetch(halves, way, _pixels(h, w, CELL // 2), inverse)
+    _, deviation, n = agreement(values, witnesses(seen, alike))
+    both = (n > 1.5).astype(jnp.float32)
+    sums = jnp.concatenate([deviation.mean(-1, keepdims=True) * both, both], -1)
+    sums = _cells(
+        sums.reshape(cuts, h, w, 2), 2
+    )  # of a cell: deviation where two photos see it, and how much
+    told = [jnp.where(sums[..., 1] > 0, sums[..., 0] / jnp.maximum(sums[..., 1], EPS), 0.3)]
+    rows, columns = _region(h // 2), _region(w // 2)
+    region = jnp.einsum("ij,kjlc,ml->kimc", rows, sums, columns)
+    whole = jnp.broadcast_to(sums.mean((1, 2), keepdims=True), sums.shape)
+    for around in (region, whole):
+        known = around[..., 1] > SHARED / 4
+        level = jnp.log(around[..., 0] / jnp.maximum(around[..., 1], EPS) + 0.01)
+        best = jnp.min(jnp.where(known, level, jnp.inf), 0, keepdims=True)
+        best = jnp.where(jnp.isfinite(best), best, 0.0)
+        told += [jnp.where(known, level - best, 1.0), around[..., 1]]
+    return jnp.stack(told, -1)
+
+
+def _region(n: int) -> np.ndarray:
+    """Weights [n, n] of the cells around each of `n` in a row."""
+    apart = np.arange(n)[:, None] - np.arange(n)[None]
+    weights = np.exp(-0.5 * np.square(apart / REGION))
+    return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
+
+
+def _coarse(p: Tree, maps, alike, way: Motion, reach, prior, context, head, around):
+    """One view's distribution over the cuts of a cell, from prior [ch, cw, k], context [ch, cw, c] and the agreement of
+    colours [k, ch, cw, 5]; `way` in cells.
 
     Returns the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there [ch, cw], and the hidden
     state [ch, cw, c].
     """
     ch, cw, cuts = prior.shape
-    shrink = jnp.asarray([1 / CELL, 1 / CELL, 1.0])
-    way = Motion(shrink[None, :, None] * way.turn, shrink[None] * way.shift)
     numbers = jnp.arange(cuts, dtype=jnp.float32)
-    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, ch * cw))
+    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts, reach)[:, None], (cuts, ch * cw))
     values, seen = fetch(maps, way, _pixels(ch, cw, CELL), inverse)
     agreed = agreement(values, witnesses(seen, alike))
     mean, deviation, n = (x.reshape(cuts, ch, cw, -1) for x in agreed)
-    prior = jnp.moveaxis(prior, -1, 0)
+    # The rays speak of the cuts of the whole axis: between two of them, in proportion.
+    between = jnp.maximum(1.0 - jnp.abs(reach * numbers[:, None] - numbers[None]), 0.0)
+    prior = jnp.einsum("jk,yxk->jyx", between, prior)
     colour = mean[..., MATCHED:]
     evidence = [
         deviation[..., :MATCHED],
@@ -253,6 +333,7 @@ def _coarse(p: Tree, maps, alike, way: Motion, prior, context, head):
         *_counts(n),
         prior[..., None],
         jnp.broadcast_to(context[None], (cuts, *context.shape)),
+        jax.lax.stop_gradient(around),
     ]
     y = linear(p["enter"], jnp.concatenate(evidence, -1))
     for i in range(BLOCKS):
@@ -273,13 +354,13 @@ def _coarse(p: Tree, maps, alike, way: Motion, prior, context, head):
     return colours, cut, mass, (share[..., None] * y).sum(0)
 
 
-def _fine(p: Tree, photos, alike, cuts: int, way: Motion, cut, head):
+def _fine(p: Tree, photos, alike, cuts: int, way: Motion, reach, cut, head):
     """One view's colours in every photo [m, h, w, 3] about the cut [h, w], how much of them is seen [m, h, w, 1], and the
     cut itself, refined.
     """
     h, w = cut.shape
     offsets = jnp.asarray((np.arange(FINE) - (FINE - 1) / 2) / 4, jnp.float32)
-    inverse = inverse_depth(offsets[:, None] + cut.reshape(1, -1), cuts)
+    inverse = inverse_depth(offsets[:, None] + cut.reshape(1, -1), cuts, reach)
     values, seen = fetch(photos, way, _pixels(h, w, 1), inverse)
     agreed = agreement(values, witnesses(seen, alike))
     mean, deviation, n = (x.reshape(FINE, h, w, -1) for x in agreed)

@@ -16,12 +16,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from .. import cost
+from .. import cost, model
 from ..config import RoGeConfig
 from ..core import program, sharding
 from ..core.attention import scores_limit
 from ..core.params import Tree, abstract, count, flatten, unflatten
 from ..recon.vggt import encoder_grid
+from . import encoded
 from .loop import initial_state, make_step
 from .optim import make_optimiser
 from .stages import OBJECTIVES, Stage, stage_config, stage_specs
@@ -71,13 +72,17 @@ def abstract_batch(config: RoGeConfig, stage: Stage, m: int, scenes: int) -> Tre
     if stage.objective == "vae":
         size = (stage.crop, stage.crop) if stage.crop else (config.height, config.width)
         return {"target_rgb": array(n, *size, 3)}
-    return {
+    batch = {
         "context_rgb": array(m, config.height, config.width, 3),
         "target_rgb": array(n, config.height, config.width, 3),
         "K": array(views, 3, 3),
         "c2w": array(views, 4, 4),
         "vectors": array(m, 11),
     }
+    if stage.objective != "encoded":
+        return batch
+    encode = functools.partial(encoded.encode, config=config)
+    return jax.eval_shape(jax.vmap(encode, (None, 0)), abstract(model.specs(config)), batch)
 
 
 def abstract_frozen(specs: Tree, dtype: Any) -> Tree:

@@ -16,18 +16,19 @@ import numpy as np
 from .. import fusion, model, preview
 from ..config import RoGeConfig
 from ..core.lora import attach
-from ..core.params import Tree
+from ..core.params import Tree, flatten
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
 from ..recon.picture import decode_all
 from ..video import dit, vae, vae_training
+from . import encoded
 from .optim import OptimConfig
 
 
 @dataclass(frozen=True)
 class Stage:
     name: str
-    objective: str  # vae | recon | prior | joint
+    objective: str  # vae | recon | prior | joint | encoded
     trains: str  # regular expression for parameter paths
     steps: int
     batch: int
@@ -40,6 +41,7 @@ class Stage:
     recon_shrink: int = 1  # divides the size at which the reconstruction works
     lookup: bool = False  # train the photo look-up on a finished reconstruction
     about_preview: bool = False  # measure the preview first, if nobody has: `measure_preview`
+    stored: int = 0  # samples that were encoded once (`once_encoded`); 0: every sample is new
 
 
 def vae_objective(trainable, frozen, batch, key, *, config, stage):
@@ -104,15 +106,33 @@ def joint_objective(trainable, frozen, batch, key, *, config, stage):
     )
 
 
+def encoded_objective(trainable, frozen, batch, key, *, config, stage):
+    """The flow term of `joint_objective` on samples that were encoded before (`training.encoded`)."""
+    params = attach(frozen, trainable)
+    options = {"config": config, "draws": stage.draws, "remat": stage.remat}
+    loss = model.over_scenes(
+        lambda clip, key: encoded.flow_term(params, clip, key, **options),
+        batch,
+        jax.random.split(key, batch["K"].shape[0]),
+    ).mean()
+    return loss, {"flow": loss}
+
+
 LEVELS = 0.3  # weight of the look-up's levels beside its picture
 
-READS = {"vae": "^vae/", "recon": "^(encoder|renderer)/"}  # other objectives read the whole model
+# Other objectives read the whole model.
+READS = {
+    "vae": "^vae/",
+    "recon": "^(encoder|renderer)/",
+    "encoded": "^(dit|fusion|prompt)/",
+}
 
 OBJECTIVES = {
     "vae": vae_objective,
     "recon": recon_objective,
     "prior": prior_objective,
     "joint": joint_objective,
+    "encoded": encoded_objective,
 }
 
 _SCRATCH = OptimConfig(
@@ -138,7 +158,7 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
-    few = ViewConfig(targets=4, near=0.3, faults=0.3)
+    few = ViewConfig(targets=4, near=0.5, faults=0.3, context_weights=(0.05, 0.35, 0.4, 0.2))
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=crop),
@@ -191,6 +211,12 @@ def for_one_scene(stage: Stage) -> Stage:
     return dataclasses.replace(stage, draws=8, optim=optim)
 
 
+def once_encoded(stage: Stage, config: RoGeConfig, samples: int) -> Stage:
+    """The stage on `samples` encoded once. Raises: UserError if it trains what encodes them."""
+    encoded.check_trained(stage.name, flatten(stage_specs(config, stage)[0]))
+    return dataclasses.replace(stage, objective="encoded", stored=samples)
+
+
 def find_stage(stages: list[Stage], name: str) -> Stage:
     for stage in stages:
         if stage.name == name:
@@ -202,7 +228,9 @@ def stage_config(config: RoGeConfig, stage: Stage) -> RoGeConfig:
     """The model's configuration at the stage's resolution and clip length."""
     size = stage.views.size or (config.height, config.width)
     shrink = stage.recon_shrink
-    frames = stage.views.targets if stage.objective in ("joint", "prior") else config.frames
+    frames = (
+        stage.views.targets if stage.objective in ("joint", "prior", "encoded") else config.frames
+    )
     return dataclasses.replace(
         config,
         height=size[0],
@@ -350,8 +378,13 @@ def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, cli
     return np.concatenate(found)
 
 
-def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16):
-    """evaluate(trainable) -> the stage's own terms on held-out procedural scenes, prefixed `held_`."""
+def held_out(
+    objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16, encode=None
+):
+    """evaluate(trainable) -> the stage's own terms on held-out procedural scenes, prefixed `held_`.
+
+    `encode`: from the arrays of one sample to those that the objective takes; None: as they are.
+    """
     from ..data.procedural import HELDOUT_SEED, sample_sequence
 
     frames = max(24, config.frames + 3)
@@ -363,6 +396,8 @@ def held_out(objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: 
     views = dataclasses.replace(views, contexts=(3,), context_weights=(1.0,), size=None)
     fixed = dataclasses.replace(stage, views=views, batch=4)
     batches = [stage_batch(pool, fixed, config, 0, i) for i in range(scenes // 4)]
+    if encode is not None:
+        batches = [encoded.each(encode, batch) for batch in batches]
     run = jax.jit(objective)
 
     def evaluate(trainable: Tree) -> dict[str, float]:

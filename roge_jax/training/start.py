@@ -2,7 +2,8 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,8 @@ from ..cost import keeps_float32
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
-from .stages import Stage, stage_config
+from . import encoded
+from .stages import Stage, stage_batch, stage_config
 
 
 def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
@@ -56,6 +58,7 @@ def hold_settings(
         "frozen dtype": frozen_dtype,
         "start contents": model_fingerprint(params, config),
         "data contents": "procedural scenes",
+        "samples encoded once": stage.stored,
     }
     if pool is not None:
         settings["data contents"] = pool_fingerprint(pool)
@@ -75,12 +78,46 @@ def hold_settings(
     return told
 
 
+def samples(
+    stage: Stage,
+    source,
+    params: Tree,
+    config: RoGeConfig,
+    seed: int,
+    rows,
+    folder: Path,
+    *,
+    resume: bool,
+) -> tuple[Callable[[int], dict], Callable[[dict], encoded.Clip] | None]:
+    """(batch number i, what encodes a sample): of a stage on `stored` samples those in `folder`, encoded now or before;
+    of others new samples, and None. `config` is the stage's own; `rows` of a batch are this process'.
+    """
+    if not stage.stored:
+        return lambda i: stage_batch(source, stage, config, seed, i, rows), None
+    one = dataclasses.replace(stage, batch=1)
+    encode = functools.partial(
+        jax.jit(encoded.encode, static_argnames="config"), params, config=config
+    )
+    clips = encoded.Clips(
+        folder,
+        stage.stored,
+        lambda i: stage_batch(source, one, config, seed, i),
+        encode,
+        resume=resume,
+    )
+    return lambda i: clips.batch(seed, i, stage.batch), encode
+
+
 def check_processes(
     options: Mapping[str, Any], start: str, pool: Path | None, *, version: str
 ) -> None:
     """Raise UserError in every process of a run that was not started alike everywhere: options, code, model or data."""
     if jax.process_count() == 1:
         return
+    if options.get("encode_once"):
+        raise UserError(
+            f"--encode-once is for one process, and {jax.process_count()} are running: leave it out."
+        )
     if options.get("devices"):
         raise UserError(
             f"--devices {options['devices']} is for one process, and {jax.process_count()} are running: leave it out."
