@@ -24,7 +24,10 @@ from .folders import output_folder, write_json
 
 SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
 RENDERED = 32  # views of a procedural scene
-TRAJECTORY = "orbit:degrees=12"  # gentle: two photos side by side show little of the rest
+THROUGH, ALONE = (
+    "interpolate:order=shortest",
+    "orbit:degrees=12",
+)  # paths of several photos, and of one
 DTYPES = ("auto", "float32", "bfloat16")
 LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
 
@@ -52,9 +55,10 @@ def parser() -> argparse.ArgumentParser:
     option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", SCENE)
     paths = ", ".join(sorted(PRESETS))
     path_help = (
-        f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false"
+        f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false "
+        f"(default: {THROUGH}; of a single photo {ALONE})"
     )
-    option("--trajectory", path_help, TRAJECTORY, metavar="NAME|FILE")
+    option("--trajectory", path_help, metavar="NAME|FILE")
     frames_help = f"length of the path, up to {MOST_FRAMES}; the model's window, or the file's own"
     option("--frames", frames_help, type=number(1))
     option("--steps", f"sampling steps{own}", type=number(1))
@@ -136,6 +140,8 @@ def camera_path(args: argparse.Namespace, context, config):
     from .geometry.trajectories import PRESETS, load_path, make_path, parse_options
 
     _check_length(args.frames or 0, f"--frames {args.frames}")
+    if args.trajectory is None:
+        args.trajectory = THROUGH if len(context) > 1 else ALONE
     name, _, words = args.trajectory.partition(":")
     file = Path(args.trajectory)
     if file.suffix.lower() == ".json" or is_file(file):

@@ -13,7 +13,7 @@ from roge_jax.core.params import flatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import make_sample
 from roge_jax.errors import UserError
-from roge_jax.training import encoded, stages
+from roge_jax.training import encoded, room, stages
 
 
 def with_preview():
@@ -127,3 +127,17 @@ def test_an_encoded_stage_reads_the_transformer_alone():
     trained, frozen = stages.stage_specs(config, stages.once_encoded(stage, config, 4))
     assert {path.split("/")[0] for path in flatten(trained)} == {"dit", "fusion"}
     assert not any(path.startswith(("vae/", "encoder/", "renderer/")) for path in flatten(frozen))
+
+
+def test_the_disk_must_hold_the_samples(tmp_path, monkeypatch):
+    config = small()
+    stage = stages.find_stage(stages.mini_stages(frames=config.frames), "generator")
+    found = []
+    monkeypatch.setattr(room, "check_disk", lambda needed, *rest, **more: found.append(needed))
+    for one in (stage, stages.once_encoded(stage, config, 10)):
+        room.check_space(tmp_path, [(one, config)], save_every=100)
+    scene = sample_sequence(3, frames=4 + config.frames, height=config.height, width=config.width)
+    views = make_sample(scene["rgb"] / 255.0, scene["K"], scene["c2w"], 4, scale_rule="lagernvs")
+    params = model.init(jax.random.key(0), config)
+    clip = jax.eval_shape(lambda p, v: encoded.encode(p, v, config=config), params, views)
+    assert found[1] - found[0] == 10 * sum(x.size * x.dtype.itemsize for x in clip.values())

@@ -353,11 +353,7 @@ def arguments(*words):
 
 def test_defaults_are_the_contract():
     args = arguments()
-    assert (args.checkpoint, args.scene, args.trajectory) == (
-        "mini",
-        "motorcycle",
-        "orbit:degrees=12",
-    )
+    assert (args.checkpoint, args.scene, args.trajectory) == ("mini", "motorcycle", None)
     assert (args.long, args.context_slots, args.fps, args.seed) == ("chain", "noised", 16.0, 0)
 
 
@@ -373,6 +369,19 @@ def test_defaults_are_the_contract():
 )
 def test_context_words(text, ids, place):
     assert sampling.context_ids(text, load_scene(place / "scene"), 9) == ids
+
+
+def test_the_path_goes_through_the_photos_and_around_a_single_one(photos):
+    args = arguments("--frames", 5)
+    path = sample.camera_path(args, photos.cameras, CONFIG)
+    assert args.trajectory == sample.THROUGH  # for run.json
+    ends = [np.abs(path.c2w - pose).max((1, 2)).argmin() for pose in photos.cameras.c2w]
+    assert {0, 4} <= set(ends) and np.abs(path.c2w[0] - photos.cameras.c2w).max((1, 2)).min() < 1e-9
+    args = arguments("--frames", 5)
+    path = sample.camera_path(args, photos.cameras[:1], CONFIG)
+    assert args.trajectory == sample.ALONE
+    np.testing.assert_allclose(path.c2w[0], photos.cameras.c2w[0], atol=1e-9)
+    assert np.ptp(path.c2w[:, :3, 3], 0).max() > 0
 
 
 def test_field_of_view_and_size(place, photos):

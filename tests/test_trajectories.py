@@ -218,6 +218,14 @@ def test_interpolate_through_duplicates_and_one_view():
     np.testing.assert_array_equal(still.c2w, np.repeat(CONTEXT.c2w[:1], 4, 0))
 
 
+@pytest.mark.parametrize("order", ["given", "shortest"])
+def test_interpolate_begins_at_the_start(order):
+    path = make_path("interpolate", CONTEXT, 400, order=order, start=2)
+    np.testing.assert_allclose(path.c2w[0], CONTEXT.c2w[2], atol=1e-9)
+    met = [np.abs(path.c2w - pose).max((1, 2)).min() < 0.05 for pose in CONTEXT.c2w]
+    assert all(met)
+
+
 def test_shortest_order():
     """Shuffled views of an arc are visited along the arc."""
     shuffled = CONTEXT[[2, 0, 4, 1, 3]]

@@ -35,6 +35,7 @@ MOST = 1e6  # of any option: turns, degrees, lengths in units of the focus
 class Rig:
     """What a preset works with: the start camera, the context, the scene's distance and up."""
 
+    first: int  # the start camera's place in the context
     start: np.ndarray  # c2w [4, 4]
     K: np.ndarray  # [3, 3]
     context: Cameras
@@ -90,7 +91,7 @@ def make_path(
     distance = number(given, where, "focus")
     if not 0 < distance < 1e100:
         raise UserError(f"focus={focus} is no distance: give a positive number in scene units.")
-    rig = Rig(context.c2w[start], context.K[start], context, distance, world_up(context))
+    rig = Rig(start, context.c2w[start], context.K[start], context, distance, world_up(context))
     s = np.linspace(0.0, 1.0, frames) if frames > 1 else np.zeros(1)
     s = s * s * (3.0 - 2.0 * s) if ease else s
     c2w, K = preset(rig, s, **options)
@@ -213,11 +214,15 @@ def lemniscate(rig: Rig, s: np.ndarray, radius: float = 0.2) -> Poses:
 
 
 def interpolated(rig: Rig, s: np.ndarray, order: str = "given") -> Poses:
-    """Through all context views, in the given order or along a short route (`shortest`)."""
+    """Through all context views, in the given order or along a short route (`shortest`), which begins where it is
+    shortest or at a start other than 0.
+    """
     if order not in ("given", "shortest"):
         raise UserError(f"order='{order}': {did_you_mean(order, ('given', 'shortest'))}")
-    keys = rig.context if order == "given" else rig.context[_route(rig.context)]
-    path = interpolate(keys, s, unit=rig.focus)
+    order_of = np.roll(np.arange(len(rig.context)), -rig.first)
+    if order == "shortest":
+        order_of = _route(rig.context, rig.first or None)
+    path = interpolate(rig.context[order_of], s, unit=rig.focus)
     return path.c2w, path.K
 
 
@@ -337,11 +342,11 @@ def _looking(rig: Rig, offsets: np.ndarray) -> np.ndarray:
     return rig.start[None] @ local
 
 
-def _route(context: Cameras) -> np.ndarray:
-    """A short open route through all centres: the best of the nearest-neighbour routes."""
+def _route(context: Cameras, start: int | None = None) -> np.ndarray:
+    """A short open route through all centres: the nearest-neighbour route from `start`, or the best of all of them."""
     gaps = np.linalg.norm(context.centres[:, None] - context.centres[None], axis=-1)
     best, shortest = np.arange(len(gaps)), np.inf
-    for first in range(len(gaps)):
+    for first in range(len(gaps)) if start is None else [start]:
         route, left = [first], set(range(len(gaps))) - {first}
         while left:
             route.append(min(sorted(left), key=lambda view: gaps[route[-1], view]))
@@ -349,4 +354,4 @@ def _route(context: Cameras) -> np.ndarray:
         length = gaps[route[:-1], route[1:]].sum()
         if length < shortest:
             best, shortest = np.array(route), length
-    return best if best[0] <= best[-1] else best[::-1]
+    return best if start is not None or best[0] <= best[-1] else best[::-1]

@@ -204,6 +204,14 @@ def state_bytes(config: RoGeConfig, stage: Stage) -> float:
     return _tree_bytes(abstract_state(config, stage))
 
 
+def stored_bytes(config: RoGeConfig, stage: Stage) -> float:
+    """Bytes of the samples that a stage keeps encoded, those with the most photos; 0 if it keeps none."""
+    if not stage.stored:
+        return 0.0
+    most = max(stage.views.contexts)
+    return stage.stored * _tree_bytes(abstract_batch(stage_config(config, stage), stage, most, 1))
+
+
 def _held_all(config, stage, mesh, dtype) -> dict[str, float]:
     specs, frozen_specs = stage_specs(config, stage)
     state, frozen = abstract_state(config, stage), abstract_frozen(frozen_specs, dtype)

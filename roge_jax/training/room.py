@@ -95,7 +95,8 @@ def check_space(
         kept = min(keep, -(-stage.steps // save_every))
         needed += kept * estimate.state_bytes(config, stage) + 4.0 * count(model.specs(config))
         needed += 4.0 * count(specs) if stage.lora else 0.0
-    what = "What the run keeps (checkpoints and models)"
+        needed += estimate.stored_bytes(config, stage)
+    what = "What the run keeps (checkpoints, models, encoded samples)"
     check_disk(needed, out, what, held=[out / stage.name for stage, _ in recipe])
 
 
