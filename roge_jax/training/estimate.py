@@ -194,6 +194,12 @@ def lasting(
     }
 
 
+def largest_frozen(config: RoGeConfig, stage: Stage, *, dtype: Any) -> float:
+    """Bytes of the largest frozen leaf that the stage reads, whole."""
+    frozen = abstract_frozen(stage_specs(config, stage)[1], dtype)
+    return max((program.size(x) for x in jax.tree.leaves(frozen)), default=0.0)
+
+
 def state_bytes(config: RoGeConfig, stage: Stage) -> float:
     """Bytes of one checkpoint, which holds whole arrays."""
     return _tree_bytes(abstract_state(config, stage))

@@ -2,21 +2,24 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from .. import checkpoint
 from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
 from ..core import distributed
-from ..core.params import Tree, flatten, unflatten
+from ..core.params import Tree
 from ..cost import keeps_float32
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
 from .stages import Stage, stage_config
+
+PUT_BACK = "put it back and continue with --resume, nothing that was trained is lost"
 
 
 def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
@@ -54,7 +57,7 @@ def hold_settings(
         "seed": seed,
         "learning rate": stage.optim.learning_rate,
         "frozen dtype": frozen_dtype,
-        "start contents": model_fingerprint(params, config),
+        "start contents": model_fingerprint(params, config, "float32"),
         "data contents": "procedural scenes",
     }
     if pool is not None:
@@ -146,12 +149,30 @@ def on_host() -> contextlib.AbstractContextManager:
     return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
 
 
-def in_precision(frozen: Tree, dtype: str) -> Tree:
-    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
+def kept_as(dtype: str) -> Callable[[str], str]:
+    """What a frozen leaf is kept in, by its path: large matrices `dtype`; the VAE, norms and modulation float32."""
+    return lambda path: "float32" if keeps_float32(path) else dtype
+
+
+def place_frozen(frozen: Tree, dtype: str, shardings: Tree | None = None) -> Tree:
+    """Frozen weights where they stay, leaf by leaf from wherever they lie; without `shardings` in host memory."""
     with on_host():
-        return unflatten(
-            {
-                path: x if keeps_float32(path) else x.astype(dtype)
-                for path, x in flatten(frozen).items()
-            }
+        return checkpoint.placed(frozen, kept_as(dtype), shardings)
+
+
+def fingerprint(params: Tree, start: str) -> str:
+    """`weights_fingerprint` of the model `start` in float32. Raises: UserError if its files are gone."""
+    try:
+        return checkpoint.weights_fingerprint(params, dtype="float32")
+    except (OSError, ValueError) as error:  # gone, or shorter than it was
+        raise UserError(
+            f"The model that this run started from, {start}, cannot be read ({error}): {PUT_BACK}."
+        ) from None
+
+
+def check_unchanged(params: Tree, origin: str, start: str) -> None:
+    """Raise UserError if `fingerprint` is no longer `origin`: what is saved is the start and what training changed."""
+    if fingerprint(params, start) != origin:
+        raise UserError(
+            f"The model that this run started from, {start}, has changed since: {PUT_BACK}."
         )
