@@ -162,11 +162,11 @@ def _kind(leaf: Any, dtype: Any) -> np.dtype:
 
 
 def _pieces(leaf: Any, a: Any = None, b: Any = None) -> Iterator[np.ndarray]:
-    """A leaf in pieces along its first axis; with the factors a and b, kernel + a @ b layer by layer, in float32."""
+    """The numbers of a leaf, some at a time; with the factors a and b of kernel + a @ b, layer by layer in float32."""
     value = np.asarray(leaf)
     if a is None:
-        rows = max(1, PIECE_BYTES * len(value) // max(value.nbytes, 1)) if value.ndim else 0
-        yield from (value[i : i + rows] for i in range(0, len(value), rows)) if rows else (value,)
+        value, n = value.reshape(-1), PIECE_BYTES // value.itemsize
+        yield from (value[i : i + n] for i in range(0, value.size, n))
         return
     stack = zip(value, a, b, strict=True) if np.ndim(a) == 3 else [(value, a, b)]
     for kernel, left, right in stack:

@@ -285,6 +285,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     from .core.lora import attach
     from .core.params import count, flatten, loaded, unflatten
     from .core.params import init as init_specs
+    from .cost import kept_as
     from .training import loop, stages, start
 
     out = args.out / stage.name
@@ -332,7 +333,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     frozen = start.place_frozen(stages.read(frozen, stage), dtype, where)
     if args.show_mesh:
         shown = sharding.abstract_mesh() if mesh is None else mesh
-        kept = sharding.describe(frozen_specs, shown, start.kept_as(dtype))
+        kept = sharding.describe(frozen_specs, shown, kept_as(dtype))
         say(f"trains: {sharding.describe(specs, shown)}\nfrozen: {kept}")
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
     say(

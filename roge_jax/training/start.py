@@ -2,7 +2,7 @@
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
 from ..core import distributed
 from ..core.params import Tree
-from ..cost import keeps_float32
+from ..cost import kept_as
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
@@ -149,13 +149,8 @@ def on_host() -> contextlib.AbstractContextManager:
     return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
 
 
-def kept_as(dtype: str) -> Callable[[str], str]:
-    """What a frozen leaf is kept in, by its path: large matrices `dtype`; the VAE, norms and modulation float32."""
-    return lambda path: "float32" if keeps_float32(path) else dtype
-
-
 def place_frozen(frozen: Tree, dtype: str, shardings: Tree | None = None) -> Tree:
-    """Frozen weights where they stay, leaf by leaf from wherever they lie; without `shardings` in host memory."""
+    """Frozen weights where they stay and as they are kept, leaf by leaf; without `shardings` in host memory."""
     with on_host():
         return checkpoint.placed(frozen, kept_as(dtype), shardings)
 
