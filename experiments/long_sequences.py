@@ -5,7 +5,9 @@
 forward   480x832, M = 9, N = 81: prepare's shapes and one evaluation of a narrow transformer on all 46,800 tokens
 chain     chained paths of 25, 100 and 305 frames (5, 20 and 61 windows), `tiny` preset, random weights, one step each:
           compilations, bytes of live device arrays and resident memory after every window
-load      a random model of 1.2 GB on disk: memory while it is loaded whole, and into shares on four devices
+load      a random model of 1.41 GB on disk: memory while it is loaded whole, and into shares on four devices
+train     the same in bfloat16: memory of a training program that takes one step, of a stage that reads the whole model
+          and of one that reads the reconstruction alone; beside that of `tiny` itself, which is compiled as long
 
 Writes experiments/results/long_sequences.json.
 """
@@ -25,7 +27,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 RESULT = HERE / "results" / "long_sequences.json"
-PARTS = ("forward", "chain", "load")
+PARTS = ("forward", "chain", "load", "train")
 
 
 def resident() -> float:
@@ -137,18 +139,25 @@ def chain() -> dict:
     return found
 
 
+def wide():
+    """`tiny` with a transformer of 0.35e9 parameters."""
+    from roge_jax import config
+
+    tiny = config.preset("tiny")
+    transformer = dataclasses.replace(tiny.dit, width=1024, heads=16, depth=20, ffn=4096)
+    return dataclasses.replace(tiny, dit=transformer)
+
+
 def load(kind: str = "") -> dict:
     """Without `kind`: writes the file and starts a process for each way of loading it."""
     import jax
 
-    from roge_jax import checkpoint, config, model
+    from roge_jax import checkpoint, model
     from roge_jax.core import sharding
     from roge_jax.core.params import abstract, flatten
 
     if not kind:
-        tiny = config.preset("tiny")
-        wide = dataclasses.replace(tiny.dit, width=1024, heads=16, depth=20, ffn=4096)
-        cfg = dataclasses.replace(tiny, dit=wide)
+        cfg = wide()
         sizes = [4 * x.size for x in jax.tree.leaves(abstract(model.specs(cfg)))]
         found = {"bytes": sum(sizes), "largest_leaf": max(sizes), "leaves": len(sizes)}
         with tempfile.TemporaryDirectory() as folder:
@@ -174,6 +183,28 @@ def load(kind: str = "") -> dict:
     }
 
 
+def train(kind: str = "") -> dict:
+    """Without `kind`: writes the models and starts a process for each stage of each."""
+    from roge_jax import checkpoint, config, model
+    from roge_jax import train as program
+
+    if kind:
+        stage, _, folder = kind.partition(":")
+        words = ["tiny", "--stage", stage, "--steps", "1", "--batch", "1", "--devices", "1"]
+        words += ["--frozen-dtype", "bfloat16", "--init", folder, "--out", f"{folder}-{stage}"]
+        program.main(program.parser().parse_args(words))
+        return {"peak": peak()}
+    found: dict = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for name, cfg in (("tiny", config.preset("tiny")), ("wide", wide())):
+            weights = random_weights(model.specs(cfg))
+            checkpoint.save_model(Path(folder) / name, weights, cfg)
+            del weights
+            for stage in ("lora", "recon_low"):
+                found[f"{name}, {stage}"] = child("train", f"{stage}:{folder}/{name}")
+    return found
+
+
 def child(part: str, kind: str = "", devices: int = 1) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "out.json"
@@ -193,11 +224,8 @@ def main() -> None:
     args = p.parse_args()
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if args.child:
-        found = (
-            load(args.kind)
-            if args.part == "load"
-            else {"forward": forward, "chain": chain}[args.part]()
-        )
+        run = {"forward": forward, "chain": chain, "load": load, "train": train}[args.part]
+        found = run(args.kind) if args.part in ("load", "train") else run()
         return args.child.write_text(json.dumps(found)) and None
     for part in (args.part,) if args.part else PARTS:
         found = child(part)

@@ -132,9 +132,9 @@ def parts(trial: Trial):
         trainable = attach(trainable, init_specs(jax.random.key(SEED + 1), added))
         specs = attach(specs, added)
     if trial.frozen != jnp.float32:
-        from roge_jax.train import in_precision
+        from roge_jax.training.start import place_frozen
 
-        frozen = in_precision(frozen, "bfloat16")
+        frozen = place_frozen(frozen, "bfloat16")
     trainable = jax.tree.map(lambda x: x.astype(trial.trained), trainable)
     return trainable, frozen, specs
 

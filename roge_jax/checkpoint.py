@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ import numpy as np
 
 from . import model
 from .config import PRESETS, RoGeConfig, from_dict, to_dict
+from .core.lora import merged
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
 from .fields import exists, is_file, read_json
 from .folders import fingerprint, put, sync
 
 SHARD_BYTES = 15_000_000
+PIECE_BYTES = 16_000_000  # of a leaf that are written at a time
 ADAPTER = "adapter.safetensors"
 CHECKSUMS = "sha256.json"  # in a training checkpoint: what each of its files must hash to
 ASSETS = Path(__file__).with_name("assets")
@@ -123,35 +125,58 @@ def save_model(
     *,
     dtype=jnp.bfloat16,
     provenance: dict | None = None,
+    lora: Tree | None = None,
 ) -> None:
-    """Write a model folder. Floating leaves are stored in `dtype`; an existing model there is replaced whole."""
-    from safetensors.flax import save_file
+    """Write a model folder. Floating leaves are stored in `dtype`; an existing model there is replaced whole.
+
+    Leaves may lie in the files of another model (`open_model`), and are copied from there in pieces. Factors of `lora`
+    are merged into their kernels on the way, one layer of a stack at a time.
+    """
+    from .weights.shards import plan_shards
 
     folder = Path(folder)
     temporary = folder.with_name(folder.name + ".part")
     shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
-    shards: list[dict] = [{}]
-    size = 0
-    for path, leaf in flatten(params).items():
-        leaf = jnp.asarray(leaf)
-        leaf = leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
-        if size and size + leaf.nbytes > SHARD_BYTES:
-            shards.append({})
-            size = 0
-        shards[-1][path] = leaf
-        size += leaf.nbytes
-    for i, shard in enumerate(shards, 1):
-        save_file(shard, temporary / f"model-{i:05d}-of-{len(shards):05d}.safetensors")
+    leaves, factors = flatten(params), flatten(lora or {})
+    kinds = {path: (tuple(x.shape), _kind(x, dtype)) for path, x in leaves.items()}
+    layout = plan_shards(kinds, SHARD_BYTES, signed=False)
+    for shard, header in enumerate(layout.headers):
+        with (temporary / layout.name(shard)).open("wb") as file:
+            file.write(header)
+            for path in (path for path, place in layout.places.items() if place.shard == shard):
+                layer = path.removesuffix("/kernel")
+                a, b = (factors.get(f"{layer}/lora_{side}") for side in "ab")
+                for piece in _pieces(leaves[path], a, b):
+                    piece = np.ascontiguousarray(piece, kinds[path][1])
+                    file.write(piece.reshape(-1).view(np.uint8).data)
     record = {"format": 1, "config": to_dict(config), "provenance": provenance or {}}
     (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
     put(temporary, folder)
 
 
-def model_fingerprint(params: Tree, config: RoGeConfig) -> str:
+def _kind(leaf: Any, dtype: Any) -> np.dtype:
+    """`dtype` for a leaf of floating numbers; its own for any other, and if `dtype` is None."""
+    kept = dtype is None or not jnp.issubdtype(leaf.dtype, jnp.floating)
+    return np.dtype(leaf.dtype if kept else dtype)
+
+
+def _pieces(leaf: Any, a: Any = None, b: Any = None) -> Iterator[np.ndarray]:
+    """The numbers of a leaf, some at a time; with the factors a and b of kernel + a @ b, layer by layer in float32."""
+    value = np.asarray(leaf)
+    if a is None:
+        value, n = value.reshape(-1), PIECE_BYTES // value.itemsize
+        yield from (value[i : i + n] for i in range(0, value.size, n))
+        return
+    stack = zip(value, a, b, strict=True) if np.ndim(a) == 3 else [(value, a, b)]
+    for kernel, left, right in stack:
+        yield np.asarray(merged(kernel.astype(np.float32), left, right))
+
+
+def model_fingerprint(params: Tree, config: RoGeConfig, dtype: Any = None) -> str:
     """Twelve hex digits that tell this model from another, by weights and configuration alone (`folders.fingerprint`)."""
     leaves = ((path, np.asarray(leaf)) for path, leaf in flatten(params).items())
-    return fingerprint(leaves, json.dumps(to_dict(config), sort_keys=True))
+    return fingerprint(leaves, json.dumps(to_dict(config), sort_keys=True), dtype=dtype)
 
 
 def weights_fingerprint(params: Tree, dtype: Any = None) -> str:
@@ -196,7 +221,18 @@ def load_model(
     (a tree as of `core.sharding.shardings`) every device gets its share of a leaf straight from the file; without,
     leaves are whole. Host memory beside the arrays themselves holds one leaf at a time.
     """
-    from .weights.sources import Source, read_safetensors_header
+    tree, config = open_model(name)
+    wanted = dtype if callable(dtype) and not isinstance(dtype, type) else lambda path: dtype
+    return placed(tree, wanted, shardings), config
+
+
+def open_model(name: str | Path) -> tuple[Tree, RoGeConfig]:
+    """(params, config) of a model folder or shipped model whose leaves stay in the files (`sources.Stored`).
+
+    Only headers are read, and checked against the config. `np.asarray(leaf)` maps a leaf as it is stored, for as long
+    as the array lives.
+    """
+    from .weights.sources import read_safetensors_header
 
     folder = find_model(name)
     config = load_config(folder)
@@ -218,23 +254,24 @@ def load_model(
         raise UserError(
             f"{folder} is incomplete: {', '.join(lost)} missing. Copy the whole folder again."
         )
-    source = Source(folder, {})
+    flat: dict[str, Any] = {}
     for file in files:
-        source.tensors.update(read_safetensors_header(file))
-    check(unflatten(source.tensors), model.specs(config), source=str(folder))
+        flat |= read_safetensors_header(file)
+    tree = unflatten(flat)
+    check(tree, model.specs(config), source=str(folder))
+    return tree, config
+
+
+def placed(tree: Tree, dtype: Callable[[str], Any], shardings: Tree | None = None) -> Tree:
+    """The leaves of `tree` in `dtype(path)` on their devices, one after the other from wherever they lie."""
     where = {} if shardings is None else flatten(shardings)
-    wanted = dtype if callable(dtype) and not isinstance(dtype, type) else lambda path: dtype
-    flat = {
-        path: _placed(source.read(path), wanted(path), where.get(path)) for path in source.tensors
-    }
-    return unflatten(flat), config
+    flat = flatten(tree)
+    return unflatten({path: _placed(x, dtype(path), where.get(path)) for path, x in flat.items()})
 
 
-def _placed(value: np.ndarray, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
-    """A leaf of a file on its devices. Conversion is NumPy's: JAX would compile one for every shape."""
-    kept = dtype is None or not jnp.issubdtype(value.dtype, jnp.floating)
-    wanted = value.dtype if kept else jnp.dtype(dtype)
-
+def _placed(leaf: Any, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
+    """A copy of a leaf on its devices. Conversion is NumPy's: JAX would compile one for every shape."""
+    value, wanted = np.asarray(leaf), _kind(leaf, dtype)
     shares: dict[str, np.ndarray] = {}  # devices that repeat one another read the same copy
 
     def share(index) -> np.ndarray:

@@ -6,9 +6,9 @@ matters). Formulas follow the published networks: VGGT and the LagerNVS renderer
 """
 
 import dataclasses
-import functools
 import math
 import re
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -271,12 +271,12 @@ def weight_bytes(config: RoGeConfig, dtype: Any = jnp.float32) -> dict[str, floa
 
 def held_weights(config: RoGeConfig, mesh: sharding.AnyMesh, dtype: str) -> int:
     """Bytes of weights on each device of a mesh. Raises UserError if it does not divide them."""
-    kept = functools.partial(_stored_as, dtype=dtype)
-    return sharding.held(model.specs(config), mesh, kept)
+    return sharding.held(model.specs(config), mesh, kept_as(dtype))
 
 
-def _stored_as(path: str, dtype: str) -> str:
-    return "float32" if keeps_float32(path) else dtype
+def kept_as(dtype: str) -> Callable[[str], str]:
+    """What a leaf is kept in, by its path: large matrices in `dtype`, those that `keeps_float32` names in float32."""
+    return lambda path: "float32" if keeps_float32(path) else dtype
 
 
 @dataclasses.dataclass(frozen=True)

@@ -58,9 +58,11 @@ def specs(config: RoGeConfig) -> Tree:
     return tree
 
 
-def init(key: jax.Array, config: RoGeConfig) -> Tree:
-    """Random parameters (the VAE from its pass-through initialisation)."""
-    tree = init_specs(key, {k: s for k, s in specs(config).items() if k != "vae"})
+def init(key: jax.Array, config: RoGeConfig, *, make: Callable = init_specs) -> Tree:
+    """Random parameters (the VAE from its pass-through initialisation). With `make=params.drawn` all others are drawn
+    when they are asked for.
+    """
+    tree = make(key, {k: s for k, s in specs(config).items() if k != "vae"})
     return tree | {"vae": vae_training.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
 
 

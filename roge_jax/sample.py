@@ -225,7 +225,7 @@ def load_weights(args: argparse.Namespace, mesh=None):
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(
         args.checkpoint,
-        dtype=lambda path: "float32" if cost.keeps_float32(path) else dtype,
+        dtype=cost.kept_as(dtype),
         shardings=None if mesh is None else sharding.shardings(specs, mesh),
     )
 

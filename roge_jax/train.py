@@ -138,6 +138,7 @@ def main(args: argparse.Namespace) -> None:
     import jax
 
     from . import __version__, checkpoint, config, model
+    from .core.params import drawn
 
     distributed.maybe_initialise_distributed()
     from .training import start
@@ -154,9 +155,9 @@ def main(args: argparse.Namespace) -> None:
     check(args, cfg, chosen, mesh)  # now, not after hours
     with start.on_host():
         if init == "scratch":
-            params = model.init(jax.random.key(args.seed), preset)
+            params = model.init(jax.random.key(args.seed), preset, make=drawn)
         else:
-            params, _ = checkpoint.load_model(init)
+            params, _ = checkpoint.open_model(init)
     for stage in chosen:
         params, cfg = run_stage(args, stage, params, stage_size(args, stage, cfg), mesh, init)
         init = str(args.out / stage.name / "model")
@@ -227,13 +228,9 @@ def choose(args: argparse.Namespace, cfg):
     changes["remat"] = args.remat or estimate.default_remat(cfg)
     chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
     if args.encode_once:
-        alone = args.stage != "all"
-        chosen = [
-            stages_.once_encoded(s, cfg, args.encode_once)
-            if alone or s.name in ("generator", "hires")
-            else s
-            for s in chosen
-        ]
+        store = functools.partial(stages_.once_encoded, config=cfg, samples=args.encode_once)
+        some = args.stage == "all"  # those of all that can
+        chosen = [s if some and not stages_.can_store(s, cfg) else store(s) for s in chosen]
     if args.lr:
         chosen = [
             dataclasses.replace(s, optim=dataclasses.replace(s.optim, learning_rate=args.lr))
@@ -287,20 +284,24 @@ def stage_size(args: argparse.Namespace, stage, cfg):
 
 
 def run_stage(args, stage, params, cfg, mesh, base: str):
-    """Train one stage on the model named `base` and save its model; returns (params, config) for the next."""
+    """Train one stage on the model named `base` and save its model; returns (params, config) for the next.
+
+    The leaves of `params` may lie in files (`checkpoint.open_model`), as those do that are returned. Read are those that
+    train, into float32 on the host, and those that the objective reads, each straight to where it stays.
+    """
     import jax
 
     from . import checkpoint, model
     from .core import distributed, sharding
-    from .core.lora import attach, merge
-    from .core.params import count, flatten, unflatten
+    from .core.lora import attach
+    from .core.params import count, flatten, loaded, unflatten
     from .core.params import init as init_specs
-    from .cost import keeps_float32
+    from .cost import kept_as
     from .training import loop, stages, start
 
     out = args.out / stage.name
     before = start.provenance(base)
-    origin = checkpoint.weights_fingerprint(params) if stage.lora else ""
+    opened, origin = params, start.fingerprint(params, base)
     say = print if distributed.is_main() else (lambda *_: None)
     dtype = start.kept_dtype(args.frozen_dtype)
     done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
@@ -321,8 +322,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         )
     if done:
         say(f"{stage.name}: already trained, {out / 'model'}")
-        with start.on_host():
-            return checkpoint.load_model(out / "model")
+        return checkpoint.open_model(out / "model")
     for line in told:
         say(line)
     rows = distributed.local_rows(mesh, stage.batch)
@@ -335,19 +335,16 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     stage = dataclasses.replace(stage, views=dataclasses.replace(stage.views, size=size))
     trainable, frozen = model.split(params, stage.trains)
     specs, frozen_specs = stages.stage_specs(cfg, stage)
-    if stage.lora:
-        added = stages.new_leaves(cfg, stage)
-        trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
-    frozen = stages.read(frozen, stage)
-    if dtype != "float32":
-        frozen = start.in_precision(frozen, dtype)
-    if mesh is not None:  # now, so that no device ever holds all of it twice
-        frozen = sharding.place(frozen, sharding.shardings(frozen_specs, mesh))
+    with start.on_host():
+        trainable = loaded(trainable)
+        if stage.lora:
+            added = stages.new_leaves(cfg, stage)
+            trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
+    where = None if mesh is None else sharding.shardings(frozen_specs, mesh)
+    frozen = start.place_frozen(stages.read(frozen, stage), dtype, where)
     if args.show_mesh:
         shown = sharding.abstract_mesh() if mesh is None else mesh
-        kept = sharding.describe(
-            frozen_specs, shown, lambda path: "float32" if keeps_float32(path) else dtype
-        )
+        kept = sharding.describe(frozen_specs, shown, kept_as(dtype))
         say(f"trains: {sharding.describe(specs, shown)}\nfrozen: {kept}")
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
     say(
@@ -401,8 +398,8 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     learned = sharding.gather(learned)
     lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
     full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    with start.on_host():
-        params = merge(attach(params, unflatten(full)), unflatten(lora))
+    start.check_unchanged(opened, origin, base)
+    params = attach(params, unflatten(full))
     if stages.moves_latents(full):
         cfg = stages.measure_latents(params, source, cfg, args.seed)
         cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview_std=None))
@@ -418,16 +415,23 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
         "base_provenance": before,
     }
     if distributed.is_main():
-        checkpoint.save_model(
-            out / "model", params, cfg, dtype=jax.numpy.float32, provenance=provenance
-        )
+        with start.on_host():
+            checkpoint.save_model(
+                out / "model",
+                params,
+                cfg,
+                dtype=jax.numpy.float32,
+                provenance=provenance,
+                lora=unflatten(lora),
+            )
         if stage.lora:
             data = str(args.data or "procedural scenes")
             provenance |= {"data": data, "base_weights": origin}
             checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
         print(f"{stage.name}: saved {out / 'model'}{change}")
-    return params, cfg
+    distributed.meet(f"{stage.name} is saved")
+    return checkpoint.open_model(out / "model")
 
 
 if __name__ == "__main__":

@@ -114,11 +114,16 @@ def test_samples_of_another_run_are_left_alone_and_damage_is_named(clips, tmp_pa
         found.batch(0, 0, 3)
 
 
-@pytest.mark.parametrize("stage", ["lora", "joint", "recon"])
+@pytest.mark.parametrize("stage", ["lora", "joint", "recon", "prior"])
 def test_a_stage_that_trains_what_encodes_is_refused(stage, tmp_path, capsys):
-    with pytest.raises(UserError, match=rf"stage {stage} trains .*encoder"):
+    with pytest.raises(UserError, match=rf"stage {stage} .* give it to generator or hires"):
         run("tiny", "--stage", stage, "--encode-once", 4, "--out", tmp_path)
     assert not list(tmp_path.iterdir())
+    config = small()
+    recipe = stages.mini_stages(frames=config.frames)
+    recipe += [stages.lora_stage(1, frames=config.frames, hires=hires) for hires in (False, True)]
+    able = [s.name for s in recipe if stages.can_store(s, config)]
+    assert able == ["generator", "hires"]
 
 
 def test_an_encoded_stage_reads_the_transformer_alone():

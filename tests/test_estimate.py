@@ -11,6 +11,7 @@ from test_sharding import small
 
 from roge_jax import checkpoint, config, model, train
 from roge_jax.core import program, sharding
+from roge_jax.core.attention import as_on_gpu, attention, is_attention
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
 from roge_jax.training import estimate, stages
@@ -63,6 +64,36 @@ class TestProgram:
             one = program.Program([op], (0, 1, 2), (3,), [q, k, k, q])
             assert program.flops(one) == {"": 2.0 * products * 7 * 5 * 2 * 8}
 
+    @pytest.mark.parametrize("lengths", [(64, 32), (63, 31)])
+    @pytest.mark.parametrize("policy", [None, is_attention])
+    def test_its_stand_in_is_held_like_the_kernel(self, lengths, policy, monkeypatch):
+        """The gradient traced for a GPU that is not there, with JAX's own operation and with the one that has its shapes."""
+        fused = pytest.importorskip("jax._src.cudnn.fused_attention_stablehlo")
+        monkeypatch.setattr(fused, "check_cudnn_version", lambda: 91200)
+        monkeypatch.setattr(fused, "check_compute_capability", lambda *_: True)
+        x, rows = array(2, lengths[0], 2, 16), array(lengths[1], 2, 16)
+
+        def gradient(x, rows):  # anew for every trace: JAX would keep the first
+            def block(x):
+                def scene(x):
+                    y = attention(jnp.tanh(x), rows, 2.0 * rows, dtype=jnp.bfloat16)
+                    return attention(y, y, y, dtype=jnp.bfloat16)
+
+                return jax.vmap(scene)(x)
+
+            return jax.value_and_grad(lambda x: jax.checkpoint(block, policy=policy)(x).sum())(x)
+
+        with as_on_gpu():
+            found = program.trace(gradient, x, rows)
+        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+        want = program.trace(gradient, x, rows)
+        assert program.flops(found) == program.flops(want)
+        assert sum(program.flops(found).values()) > 0
+        # The lengths that the kernel is told are a few integers.
+        assert program.peak(found).bytes == pytest.approx(program.peak(want).bytes, abs=128)
+        forward = [op for op in found.ops if op.name.endswith("_fwd")]
+        assert len(forward) == (4 if policy is None else 2), "recomputed, or kept"
+
     @pytest.mark.parametrize("remat", ["none", "full"])
     def test_gradients_of_a_deep_network_as_xla_allocates_them(self, remat):
         def block(x, w):
@@ -109,6 +140,27 @@ def test_the_papers_step_fits_80_gb_with_the_default_recomputation():
         estimate.default_remat(cfg) == "full"
         and estimate.default_remat(config.preset("mini")) == "dots"
     )
+
+
+def test_no_scores_of_the_papers_attention_are_planned_for():
+    """With them a block of the transformer alone would hold 40 heads x 6804^2 x 4 bytes."""
+    cfg = config.preset("paper")
+    stage, tokens = lora(cfg), 6804
+    found = [
+        estimate.estimate(cfg, stage, m=6, dtype=jnp.bfloat16, fused_attention=True, mesh=mesh)
+        for mesh in (None, sharding.abstract_mesh())
+    ]
+    assert found[0].tokens["transformer tokens"] == tokens
+    assert found[0].memory == found[1].memory, "one GPU, whether a mesh says so or not"
+    stored = dataclasses.replace(stage, remat="attention")
+    kept = estimate.estimate(cfg, stored, m=6, dtype=jnp.bfloat16, fused_attention=True)
+    more, d = kept.bytes - found[0].bytes, cfg.dit
+    # Of every block the results of two attentions in bfloat16 and their sums, which the kernel's gradient reads.
+    least = d.depth * 2 * tokens * (2 * d.width + 4 * d.heads)
+    assert least <= more < 1.6 * least
+    work = [sum(x.work["transformer"].values()) for x in (found[0], kept)]
+    again = d.depth * 4.0 * d.width * tokens * (tokens + d.text_len)
+    assert work[0] - work[1] == pytest.approx(again, rel=0.01), "the kernel runs once"
 
 
 def test_a_mesh_splits_what_its_table_says():

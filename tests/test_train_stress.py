@@ -24,7 +24,7 @@ from roge_jax.errors import UserError
 from roge_jax.folders import keep_settings, output_folder
 from roge_jax.training import diagnose, loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
-from roge_jax.training.start import in_precision
+from roge_jax.training.start import place_frozen
 
 # LoRA over frozen bfloat16 weights, as in the paper's stage: on the reconstruction with its loss, and (slow to compile)
 # on both halves with the joint loss. Cross attention as in `mini`, all views in one chunk.
@@ -71,7 +71,7 @@ def prepared(stage):
     goal = functools.partial(stages.OBJECTIVES[stage.objective], config=CONFIG, stage=stage)
     made = jax.jit(loop.make_step(goal, optimiser, OPTIM))
     state = loop.initial_state(trainable, optimiser, OPTIM)
-    return made, state, in_precision(frozen, "bfloat16")
+    return made, state, place_frozen(frozen, "bfloat16")
 
 
 def taken(stage, batch):

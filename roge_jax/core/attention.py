@@ -17,6 +17,7 @@ SCORES_BYTES = 1e9  # of scores that are stored at a time, where they are stored
 CACHE_BYTES = 2.0**23  # ... on a lone CPU
 PIECES = "attention_pieces"  # name for `jax.checkpoint` of what the gradient of attention in pieces keeps
 _LIMIT: contextvars.ContextVar[float | None] = contextvars.ContextVar("scores", default=None)
+_AS_ON_GPU: contextvars.ContextVar[bool] = contextvars.ContextVar("as_on_gpu", default=False)
 
 
 def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) -> jax.Array:
@@ -29,7 +30,7 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
     takes longer there than the products. Heads with few scores share the work of several cores better together.
     """
     scale = q.shape[-1] ** -0.5
-    if jax.default_backend() == "gpu" and dtype == jnp.bfloat16:
+    if dtype == jnp.bfloat16 and (_AS_ON_GPU.get() or jax.default_backend() == "gpu"):
         lead = q.shape[:-3]
         q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
         y = _fused(q, k, v, scale)
@@ -65,8 +66,36 @@ def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
         own = q[:, 0, 0, 0].astype(jnp.int32)
         queries, keys = (jnp.where(True, jnp.full(batch, n, jnp.int32), own) for n in lengths)
         told = {"query_seq_lengths": queries, "key_value_seq_lengths": keys}
-    y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn", **told)
+    if _AS_ON_GPU.get():
+        y = _kernel(q, k, v)
+    else:
+        y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn", **told)
     return y[:, : lengths[0]]
+
+
+@jax.custom_vjp
+def _kernel(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    """The shapes of the cuDNN kernel, for a trace that is never run: one operation, and one for its gradient, which
+    keeps q, k, v, the result and the logarithm of the softmax's sums.
+    """
+    return _kernel_forward(q, k, v)[0]
+
+
+def _kernel_forward(q, k, v):
+    sums = jax.ShapeDtypeStruct((q.shape[0], q.shape[2], q.shape[1]), jnp.float32)
+    made = (jax.ShapeDtypeStruct(q.shape, q.dtype), sums)
+    call = jax.ffi.ffi_call("dot_product_attention_fwd", made, vmap_method="broadcast_all")
+    y, total = call(q, k, v)
+    return y, (q, k, v, y, total)
+
+
+def _kernel_backward(kept, dy):
+    made = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in kept[:3])
+    call = jax.ffi.ffi_call("dot_product_attention_bwd", made, vmap_method="broadcast_all")
+    return tuple(call(*kept, dy))
+
+
+_kernel.defvjp(_kernel_forward, _kernel_backward)
 
 
 def _scores_bytes(q: jax.Array, k: jax.Array) -> float:
@@ -136,11 +165,21 @@ def scores_limit(limit: float | None) -> Iterator[None]:
         _LIMIT.reset(token)
 
 
+@contextlib.contextmanager
+def as_on_gpu() -> Iterator[None]:
+    """Attention in bfloat16 is traced as a GPU has it, on any machine. What is traced inside cannot be run."""
+    token = _AS_ON_GPU.set(True)
+    try:
+        yield
+    finally:
+        _AS_ON_GPU.reset(token)
+
+
 def is_attention(primitive, *_, **params) -> bool:
     """A policy of `jax.checkpoint` that keeps what attention returns (in pieces and of the fused kernel also row sums)."""
     if primitive.name == "name":
         return params["name"] in ("attention", PIECES)
-    return "dot_product_attention_fwd" in primitive.name
+    return "dot_product_attention_fwd" in params.get("target_name", primitive.name)
 
 
 def split_heads(x: jax.Array, heads: int) -> jax.Array:

@@ -119,6 +119,14 @@ def check_same(values: Mapping[str, Any], cure: str) -> None:
     )
 
 
+def meet(where: str) -> None:
+    """Return once every process has come to the same place, which has a name."""
+    if jax.process_count() > 1:
+        from jax.experimental.multihost_utils import sync_global_devices
+
+        sync_global_devices(where)
+
+
 def local_rows(mesh: Mesh | None, batch: int) -> np.ndarray:
     """Sorted indices of the scenes of a batch that this process' devices work on. Processes may share scenes."""
     if mesh is None:

@@ -49,8 +49,12 @@ def merge(params, lora) -> Tree:
     for path in factors:
         layer, _, leaf = path.rpartition("/")
         if leaf == "lora_a":
-            kernel = flat[f"{layer}/kernel"]
             a, b = factors[path], factors[f"{layer}/lora_b"]
-            delta = jnp.matmul(a, b, precision="highest").reshape(kernel.shape)
-            flat[f"{layer}/kernel"] = (kernel.astype(jnp.float32) + delta).astype(kernel.dtype)
+            flat[f"{layer}/kernel"] = merged(flat[f"{layer}/kernel"], a, b)
     return unflatten(flat)
+
+
+def merged(kernel, a, b):
+    """kernel + a @ b of one layer, or of a stack of them, in the type of the kernel."""
+    delta = jnp.matmul(a, b, precision="highest").reshape(kernel.shape)
+    return (kernel.astype(jnp.float32) + delta).astype(kernel.dtype)

@@ -108,15 +108,36 @@ def split(params: Tree, pattern: str) -> tuple[Tree, Tree]:
     )
 
 
-def init(key: jax.Array, specs) -> Tree:
-    """Initial values (not under jit). A leaf's seed is `key` and its path, so adding a leaf changes no other."""
+class Drawn(NamedTuple):
+    """An initial value that is drawn when NumPy asks for it (`np.asarray`), and is the same every time."""
+
+    spec: Spec
+    seed: tuple[int, ...]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self.spec.shape
+
+    @property
+    def dtype(self) -> np.dtype:
+        return np.dtype(self.spec.dtype)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        value = self.spec.init(np.random.default_rng(self.seed), self.shape, self.dtype)
+        return np.array(value, dtype, copy=copy)
+
+
+def drawn(key: jax.Array, specs) -> Tree:
+    """Initial values, none of them in memory. A leaf's seed is `key` and its path: adding a leaf changes no other."""
     seed = np.asarray(jax.random.key_data(key)).tolist()
+    flat = flatten(specs)
+    return unflatten({p: Drawn(s, (*seed, zlib.crc32(p.encode()))) for p, s in flat.items()})
 
-    def leaf(path: str, spec: Spec):
-        rng = np.random.default_rng([*seed, zlib.crc32(path.encode())])
-        return jnp.asarray(spec.init(rng, spec.shape, spec.dtype))
 
-    return unflatten({path: leaf(path, spec) for path, spec in flatten(specs).items()})
+def init(key: jax.Array, specs) -> Tree:
+    """`drawn` (not under jit)."""
+    flat = flatten(drawn(key, specs))
+    return unflatten({path: jnp.asarray(np.asarray(x)) for path, x in flat.items()})
 
 
 def abstract(specs) -> Tree:
@@ -146,6 +167,12 @@ def cast(tree, dtype) -> Tree:
     return jax.tree.map(
         lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
     )
+
+
+def loaded(tree) -> Tree:
+    """Every leaf of `tree`, wherever it lies, copied to a float32 array in memory."""
+    flat = flatten(tree)
+    return unflatten({path: jnp.asarray(np.array(x, np.float32)) for path, x in flat.items()})
 
 
 def check(params, specs, *, source: str = "parameters") -> None:

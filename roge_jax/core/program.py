@@ -91,7 +91,8 @@ def read(jaxpr, scope: str = "") -> Program:
 
     def walk(jaxpr, env, scope: str) -> None:
         for eqn in jaxpr.eqns:
-            name, params = eqn.primitive.name, eqn.params
+            params = eqn.params
+            name = params.get("target_name", eqn.primitive.name)  # of a foreign function, its own
             here = f"{scope}/{eqn.source_info.name_stack}"
             reads = [number(env, atom) for atom in eqn.invars]
             inner = None
@@ -155,9 +156,8 @@ def _flops(op: Op, out: Any) -> float:
         terms = math.prod(kernel) / kernel[op.params["dimension_numbers"].rhs_spec[0]]
         return 2.0 * math.prod(out.shape) * terms
     if "dot_product_attention" in op.name:  # the fused kernel: two products, five of its gradient
-        b, length, heads, width = op.shapes[0].shape
         products = 5 if "bwd" in op.name else 2
-        return 2.0 * products * b * length * op.shapes[1].shape[1] * heads * width
+        return 2.0 * products * math.prod(op.shapes[0].shape) * op.shapes[1].shape[-3]
     return 0.0
 
 

@@ -25,7 +25,7 @@ from ..folders import put
 from ..geometry.rays import plucker
 
 Clip = dict[str, jax.Array]
-TRAINED = ("dit/", "fusion/")  # what may train on encoded samples
+READS = ("encoder", "renderer", "vae")  # what encoding needs of a model
 _NAME = re.compile(r"m(\d+)_(\d+)\.npz")
 
 
@@ -82,16 +82,6 @@ def each(encode: Callable[[dict], Clip], batch: dict) -> dict[str, np.ndarray]:
     """`encode` of every sample of a batch, stacked again."""
     clips = [encode({name: x[i] for name, x in batch.items()}) for i in range(len(batch["K"]))]
     return {name: np.stack([np.asarray(clip[name]) for clip in clips]) for name in clips[0]}
-
-
-def check_trained(name: str, paths) -> None:
-    """Raise UserError if a stage that trains the leaves `paths` cannot work on encoded samples."""
-    others = sorted({path.split("/")[0] for path in paths if not path.startswith(TRAINED)})
-    if others:
-        raise UserError(
-            f"--encode-once stores what the networks in front of the transformer say, and stage {name} trains "
-            f"{', '.join(others)}: give it to generator or hires, which leave them as they are."
-        )
 
 
 class Clips:

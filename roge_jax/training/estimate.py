@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from .. import cost, model
 from ..config import RoGeConfig
 from ..core import program, sharding
-from ..core.attention import scores_limit
+from ..core.attention import as_on_gpu
 from ..core.params import Tree, abstract, count, flatten, unflatten
 from ..recon.vggt import encoder_grid
 from . import encoded
@@ -131,7 +131,8 @@ def estimate(
 ) -> Estimate:
     """What one device of `mesh` (None: a single one) does and holds in a step with m photos (None: the most there are).
 
-    `dtype`: of frozen matrices. `fused_attention`: the scores of attention are never stored (GPU, bfloat16).
+    `dtype`: of frozen matrices. `fused_attention`: where they are bfloat16, attention is the fused kernel of GPUs: one
+    operation that stores no scores, and keeps its inputs, its result and the softmax's sums for its gradient.
     Raises UserError if the mesh does not divide the batch or a leaf.
     """
     m = max(stage.views.contexts) if m is None else m
@@ -142,7 +143,7 @@ def estimate(
     if mesh is not None:
         scenes = sharding.batch_sharding(mesh, stage.batch).shard_shape((stage.batch,))[0]
     # Traced with this device's share of the scenes, but all of their tokens.
-    whole = None if mesh is None else sharding.abstract_mesh()
+    whole = sharding.abstract_mesh() if mesh is not None or fused_attention else None
     part_of = dataclasses.replace(stage, batch=scenes)
     traced, arguments = _traced(
         config, part_of, m, scenes, jnp.dtype(dtype), fused_attention, whole
@@ -150,13 +151,10 @@ def estimate(
 
     tokens = sequence_lengths(working, m)
     split = split_axes(working, tokens, scenes)
-    heads = {c.width // c.heads for c in (config.encoder, config.renderer, config.dit)}
     shares = {tuple(s.shape) for s in flatten(specs).values() if "embed" in s.axes}
 
     def weigh(value: Any, scope: str) -> float:
         size, shape = program.size(value), tuple(getattr(value, "shape", ()))
-        if fused_attention and "scores" in scope and not heads.intersection(shape):
-            return 0.0
         if shape in shares:  # a gradient lies where its parameter does
             return size / sizes["fsdp"]
         whole, axes = split.get(part(scope), (1, set()))
@@ -199,6 +197,12 @@ def lasting(
     }
 
 
+def largest_frozen(config: RoGeConfig, stage: Stage, *, dtype: Any) -> float:
+    """Bytes of the largest frozen leaf that the stage reads, whole."""
+    frozen = abstract_frozen(stage_specs(config, stage)[1], dtype)
+    return max((program.size(x) for x in jax.tree.leaves(frozen)), default=0.0)
+
+
 def state_bytes(config: RoGeConfig, stage: Stage) -> float:
     """Bytes of one checkpoint, which holds whole arrays."""
     return _tree_bytes(abstract_state(config, stage))
@@ -226,8 +230,7 @@ def _traced(
     config, stage, m, scenes, dtype, fused_attention, mesh
 ) -> tuple[program.Program, tuple]:
     step, arguments = abstract_step(config, stage, m, scenes=scenes, dtype=dtype)
-    limit = scores_limit(math.inf) if fused_attention else contextlib.nullcontext()
-    with sharding.use(mesh), limit:
+    with sharding.use(mesh), as_on_gpu() if fused_attention else contextlib.nullcontext():
         return program.trace(step, *arguments), arguments
 
 
@@ -263,10 +266,12 @@ def split_axes(
     chunk, rays = min(tokens["views"], config.renderer.chunk), tokens["rays per view"]
     per_view = (1, rays, rays + config.renderer.registers, tokens["scene tokens"])
     whole = tokens["transformer tokens"]
-    return {
+    lengths = {
         "transformer": (whole, {whole, whole * scenes}),
         "rays": (chunk, {n * chunk * t for n in (1, scenes) for t in per_view}),
     }
+    # The fused kernel of GPUs takes even lengths only.
+    return {name: (n, axes | {t + t % 2 for t in axes}) for name, (n, axes) in lengths.items()}
 
 
 def _tree_bytes(tree: Any) -> float:

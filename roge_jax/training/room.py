@@ -43,25 +43,22 @@ def check_room(
 ) -> str:
     """A line to print if a step may not fit the memory, else ''. Raises: UserError if it cannot.
 
-    Devices with memory of their own are held against it, and the host against the model that it loads, whole and in
-    float32; CPU devices share the memory of the host with that.
+    Devices with memory of their own are held against it, and the host against what it holds beside them: what trains,
+    as it was loaded, and one frozen leaf on its way. CPU devices share the memory of the host with that.
     """
     devices = [d for d in (jax.devices() if mesh is None else mesh.devices.flat) if _here(d)]
     count_here = 1 if mesh is None else len(devices)
     lasting = estimate.lasting(config, stage, mesh=mesh, dtype=dtype)
     name = f"Stage {stage.name} of '{config.name}'"
-    loaded = 4.0 * count(model.specs(config))
+    loaded = 4.0 * count(stage_specs(config, stage)[0])
     needed, room, own = sum(lasting.values()), _own_memory(devices), True
     if room is not None:
         _refuse(name, needed, "on each device, which has", room, "split the weights, --mesh fsdp=N")
-        if dtype != "float32":  # made beside the loaded weights, before any is sent to a device
-            loaded += estimate.lasting(config, stage, dtype=dtype)["frozen weights"]
-        _refuse(name, loaded, _HOST, memory_available(), "close other programs")
+        loaded += estimate.largest_frozen(config, stage, dtype=dtype)
+        _refuse(name, loaded, _HOST, memory_available(), "close other programs", "loading")
     else:
         own, room = False, memory_available()
-        # The first device uses the very arrays that were loaded, unless they are cut or rounded.
-        whole = dtype == "float32" and (mesh is None or mesh.shape["fsdp"] == 1)
-        needed = count_here * needed + loaded - whole * lasting["frozen weights"]
+        needed = count_here * needed + loaded
         _refuse(name, needed, _HOST, room, "close other programs")
     if room is None or needed < SMALL * room:
         return ""
@@ -77,11 +74,18 @@ def check_room(
     )
 
 
-def _refuse(name: str, least: float, where: str, most: float | None, cure: str) -> None:
+def _refuse(
+    name: str,
+    least: float,
+    where: str,
+    most: float | None,
+    cure: str,
+    what: str = "weights, optimiser and gradients",
+) -> None:
     if most is not None and least > most:
         raise UserError(
-            f"{name} needs {least / GB:,.3g} GB {where} {most / GB:,.3g} GB, for weights, optimiser and gradients "
-            f"alone: {cure}, or train a smaller model."
+            f"{name} needs {least / GB:,.3g} GB {where} {most / GB:,.3g} GB, for {what} alone: {cure}, or train a "
+            "smaller model."
         )
 
 

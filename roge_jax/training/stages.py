@@ -16,7 +16,7 @@ import numpy as np
 from .. import fusion, model, preview
 from ..config import RoGeConfig
 from ..core.lora import attach
-from ..core.params import Tree, flatten
+from ..core.params import Tree, loaded
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
 from ..recon.picture import decode_all
@@ -211,10 +211,20 @@ def for_one_scene(stage: Stage) -> Stage:
     return dataclasses.replace(stage, draws=8, optim=optim)
 
 
+def can_store(stage: Stage, config: RoGeConfig) -> bool:
+    """Whether a stage may train on samples encoded once: those of the joint objective that train the transformer alone."""
+    trained, _ = stage_specs(config, stage)
+    return stage.objective == "joint" and set(trained) <= {"dit", "fusion"}
+
+
 def once_encoded(stage: Stage, config: RoGeConfig, samples: int) -> Stage:
-    """The stage on `samples` encoded once. Raises: UserError if it trains what encodes them."""
-    encoded.check_trained(stage.name, flatten(stage_specs(config, stage)[0]))
-    return dataclasses.replace(stage, objective="encoded", stored=samples)
+    """The stage on `samples` that are encoded once (`training.encoded`). Raises: UserError if it trains what encodes."""
+    if can_store(stage, config):
+        return dataclasses.replace(stage, objective="encoded", stored=samples)
+    raise UserError(
+        f"--encode-once keeps what the networks in front of the transformer say of a sample, and stage {stage.name} "
+        "does without them or trains them: give it to generator or hires."
+    )
 
 
 def find_stage(stages: list[Stage], name: str) -> Stage:
@@ -290,10 +300,10 @@ def measure_latents(
     views = ViewConfig(targets=config.frames, ordered=True, size=size)
     stage = Stage("", "vae", "", 1, 1, OptimConfig(), views)
     encode = jax.jit(functools.partial(vae.encode_moments, cfg=config.vae))
-    found = []
+    weights, found = loaded(params["vae"]), []
     for i in range(clips):
         clip = stage_batch(source, stage, config, seed + 1, i)["target_rgb"][0]
-        moments = np.asarray(encode(params["vae"], 2.0 * clip - 1.0))
+        moments = np.asarray(encode(weights, 2.0 * clip - 1.0))
         found.append(moments[..., : config.vae.latent].reshape(-1, config.vae.latent))
     values = np.concatenate(found).astype(np.float64)
     latents = dataclasses.replace(
@@ -322,7 +332,8 @@ def measure_features(
         feature_mean=tuple(float(f"{x:.5g}") for x in values.mean(0)),
         feature_std=tuple(float(f"{max(x, 1e-3):.5g}") for x in values.std(0)),
     )
-    moved = fusion.restandardised(params["fusion"], config.fusion, measured)
+    adapter = {"geometry_adapter": loaded(params["fusion"]["geometry_adapter"])}
+    moved = fusion.restandardised(params["fusion"] | adapter, config.fusion, measured)
     return params | {"fusion": moved}, dataclasses.replace(config, fusion=measured)
 
 
@@ -358,22 +369,26 @@ def measure_preview(
     noise of that size.
     """
     config = measure_spread(params, source, config, seed, clips)
-    head = jax.tree.map(jnp.zeros_like, params["dit"]["head"]["linear"])
+    head = jax.tree.map(jnp.zeros_like, loaded(params["dit"]["head"]["linear"]))
     transformer = params["dit"] | {"head": params["dit"]["head"] | {"linear": head}}
     return params | {"dit": transformer}, config
 
 
 def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, clips: int):
-    """Rows [.., channels] float64 of `function(params, views)` on training clips with three photos each."""
+    """Rows [.., channels] float64 of `function(params, views)` on training clips with three photos each.
+
+    The function gets the reconstruction and the VAE, in float32.
+    """
     size = config.height, config.width
     views = ViewConfig(
         contexts=(3,), context_weights=(1.0,), targets=config.frames, ordered=True, size=size
     )
     stage = Stage("", "joint", "", 1, 1, OptimConfig(), views)
+    weights = loaded({part: params[part] for part in encoded.READS})
     run, found = jax.jit(function), []
     for i in range(clips):
         batch = stage_batch(source, stage, config, seed + 1, i)
-        one = np.asarray(run(params, {name: x[0] for name, x in batch.items()}), np.float64)
+        one = np.asarray(run(weights, {name: x[0] for name, x in batch.items()}), np.float64)
         found.append(one.reshape(-1, one.shape[-1]))
     return np.concatenate(found)
 

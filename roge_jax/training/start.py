@@ -9,16 +9,19 @@ from typing import Any
 
 import jax
 
+from .. import checkpoint
 from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
 from ..core import distributed
-from ..core.params import Tree, flatten, unflatten
-from ..cost import keeps_float32
+from ..core.params import Tree, loaded
+from ..cost import kept_as
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
 from . import encoded
 from .stages import Stage, stage_batch, stage_config
+
+PUT_BACK = "put it back and continue with --resume, nothing that was trained is lost"
 
 
 def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
@@ -56,7 +59,7 @@ def hold_settings(
         "seed": seed,
         "learning rate": stage.optim.learning_rate,
         "frozen dtype": frozen_dtype,
-        "start contents": model_fingerprint(params, config),
+        "start contents": model_fingerprint(params, config, "float32"),
         "data contents": "procedural scenes",
         "samples encoded once": stage.stored,
     }
@@ -95,8 +98,9 @@ def samples(
     if not stage.stored:
         return lambda i: stage_batch(source, stage, config, seed, i, rows), None
     one = dataclasses.replace(stage, batch=1)
+    weights = loaded({part: params[part] for part in encoded.READS})
     encode = functools.partial(
-        jax.jit(encoded.encode, static_argnames="config"), params, config=config
+        jax.jit(encoded.encode, static_argnames="config"), weights, config=config
     )
     clips = encoded.Clips(
         folder,
@@ -183,12 +187,25 @@ def on_host() -> contextlib.AbstractContextManager:
     return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
 
 
-def in_precision(frozen: Tree, dtype: str) -> Tree:
-    """Frozen weights with their large matrices in `dtype`; the VAE, norms and modulation stay float32."""
+def place_frozen(frozen: Tree, dtype: str, shardings: Tree | None = None) -> Tree:
+    """Frozen weights where they stay and as they are kept, leaf by leaf; without `shardings` in host memory."""
     with on_host():
-        return unflatten(
-            {
-                path: x if keeps_float32(path) else x.astype(dtype)
-                for path, x in flatten(frozen).items()
-            }
+        return checkpoint.placed(frozen, kept_as(dtype), shardings)
+
+
+def fingerprint(params: Tree, start: str) -> str:
+    """`weights_fingerprint` of the model `start` in float32. Raises: UserError if its files are gone."""
+    try:
+        return checkpoint.weights_fingerprint(params, dtype="float32")
+    except (OSError, ValueError) as error:  # gone, or shorter than it was
+        raise UserError(
+            f"The model that this run started from, {start}, cannot be read ({error}): {PUT_BACK}."
+        ) from None
+
+
+def check_unchanged(params: Tree, origin: str, start: str) -> None:
+    """Raise UserError if `fingerprint` is no longer `origin`: what is saved is the start and what training changed."""
+    if fingerprint(params, start) != origin:
+        raise UserError(
+            f"The model that this run started from, {start}, has changed since: {PUT_BACK}."
         )

@@ -49,9 +49,15 @@ class Layout(NamedTuple):
 
 
 def plan_shards(
-    leaves: Mapping[str, tuple[tuple[int, ...], np.dtype]], shard_bytes: float = SHARD_BYTES
+    leaves: Mapping[str, tuple[tuple[int, ...], np.dtype]],
+    shard_bytes: float = SHARD_BYTES,
+    *,
+    signed: bool = True,
 ) -> Layout:
-    """Distribute leaves over files of at most `shard_bytes`; a leaf larger than that has a file of its own."""
+    """Distribute leaves over files of at most `shard_bytes`; a leaf larger than that has a file of its own.
+
+    The places are in the order in which the bytes lie. `signed`: headers name this package.
+    """
     groups: list[list[str]] = [[]]
     room = shard_bytes
     for path, (shape, dtype) in leaves.items():
@@ -75,9 +81,8 @@ def plan_shards(
                 "shape": list(shape),
                 "data_offsets": [begin, end],
             }
-        text = json.dumps(
-            {"__metadata__": {"format": "roge_jax"}, **entries}, separators=(",", ":")
-        )
+        name = {"__metadata__": {"format": "roge_jax"}} if signed else {}
+        text = json.dumps(name | entries, separators=(",", ":"))
         header = text.encode() + b" " * (-len(text.encode()) % 8)
         headers.append(len(header).to_bytes(8, "little") + header)
         sizes.append(len(headers[-1]) + end)

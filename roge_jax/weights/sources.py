@@ -79,7 +79,10 @@ _TORCH_DTYPES = {
 
 
 class Stored(NamedTuple):
-    """Where one tensor is: `shape` elements of `dtype` from byte `offset` of `file`, `strides` elements apart."""
+    """Where one tensor is: `shape` elements of `dtype` from byte `offset` of `file`, `strides` elements apart.
+
+    NumPy takes it for an array: `np.asarray(stored)` is `stored.read()`.
+    """
 
     file: Path
     offset: int
@@ -91,6 +94,20 @@ class Stored(NamedTuple):
     def nbytes(self) -> int:
         """Bytes of the tensor."""
         return math.prod(self.shape) * self.dtype.itemsize
+
+    def read(self) -> np.ndarray:
+        """The tensor as it is stored, read-only: its pages come from the file when they are touched."""
+        if not math.prod(self.shape):
+            return np.zeros(self.shape, self.dtype)
+        if self.strides is None:
+            return np.asarray(np.memmap(self.file, self.dtype, "r", self.offset, self.shape))
+        extent = 1 + sum((n - 1) * s for n, s in zip(self.shape, self.strides, strict=True))
+        flat = np.asarray(np.memmap(self.file, self.dtype, "r", self.offset, (extent,)))
+        steps = tuple(s * self.dtype.itemsize for s in self.strides)
+        return np.lib.stride_tricks.as_strided(flat, self.shape, steps, writeable=False)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.read(), dtype, copy=copy)
 
 
 class Source(NamedTuple):
@@ -115,16 +132,8 @@ class Source(NamedTuple):
         return sum(t.nbytes for t in self.tensors.values())
 
     def read(self, key: str) -> np.ndarray:
-        """The tensor as it is stored, read-only: its pages come from the file when they are touched."""
-        t = self.tensors[key]
-        if not math.prod(t.shape):
-            return np.zeros(t.shape, t.dtype)
-        if t.strides is None:
-            return np.asarray(np.memmap(t.file, t.dtype, "r", t.offset, t.shape))
-        extent = 1 + sum((n - 1) * s for n, s in zip(t.shape, t.strides, strict=True))
-        flat = np.asarray(np.memmap(t.file, t.dtype, "r", t.offset, (extent,)))
-        steps = tuple(s * t.dtype.itemsize for s in t.strides)
-        return np.lib.stride_tricks.as_strided(flat, t.shape, steps, writeable=False)
+        """`Stored.read` of a tensor."""
+        return self.tensors[key].read()
 
 
 def open_source(path: str | Path) -> Source:
