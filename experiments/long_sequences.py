@@ -238,12 +238,11 @@ def main() -> None:
         found = child(part)
         print(part, json.dumps(found)[:2000], flush=True)
         record = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-        record[part] = found
         import jax  # noqa: F401  the record names its version
 
         from roge_jax.entry import environment
 
-        record["environment"] = environment()
+        record[part] = found | {"environment": environment()}
         RESULT.write_text(json.dumps(record, indent=1) + "\n")
 
 
