@@ -187,14 +187,21 @@ def train(kind: str = "") -> dict:
     """Without `kind`: writes the models and starts a process for each stage of each."""
     from roge_jax import checkpoint, config, model
     from roge_jax import train as program
+    from roge_jax.training import loop
+
+    begin, found = loop.train, {}
+
+    def watched(*arguments, **options):
+        found["peak_before_the_first_step"] = peak()
+        return begin(*arguments, **options)
 
     if kind:
+        loop.train = watched
         stage, _, folder = kind.partition(":")
         words = ["tiny", "--stage", stage, "--steps", "1", "--batch", "1", "--devices", "1"]
         words += ["--frozen-dtype", "bfloat16", "--init", folder, "--out", f"{folder}-{stage}"]
         program.main(program.parser().parse_args(words))
-        return {"peak": peak()}
-    found: dict = {}
+        return found | {"peak": peak()}
     with tempfile.TemporaryDirectory() as folder:
         for name, cfg in (("tiny", config.preset("tiny")), ("wide", wide())):
             weights = random_weights(model.specs(cfg))
@@ -231,12 +238,11 @@ def main() -> None:
         found = child(part)
         print(part, json.dumps(found)[:2000], flush=True)
         record = json.loads(RESULT.read_text()) if RESULT.exists() else {}
-        record[part] = found
         import jax  # noqa: F401  the record names its version
 
         from roge_jax.entry import environment
 
-        record["environment"] = environment()
+        record[part] = found | {"environment": environment()}
         RESULT.write_text(json.dumps(record, indent=1) + "\n")
 
 
