@@ -4,9 +4,11 @@ Per scene, `context` photos are spread over a run of up to frames + context cons
 generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,
 `mean_context`, `plane` at the true median depth or, without depth, swept; `depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
+With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
 """
 
 import argparse
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,12 @@ def parser() -> argparse.ArgumentParser:
         help=f"scene folders, 'motorcycle', procedural:SEED or procedural:FIRST..LAST\n(default: {HELD_OUT})",
     )
     p.add_argument("--context", type=number(1), default=3, help="photos per scene (default: 3)")
+    p.add_argument(
+        "--close",
+        type=number(1),
+        metavar="N",
+        help="N views of each scene, every one from the --context photos nearest to it",
+    )
     p.add_argument("--steps", type=number(1), help="sampling steps (default: the model's own)")
     p.add_argument("--solver", help="sampler (default: the model's own)")
     p.add_argument("--schedule", help="noise levels of the steps (default: the model's own)")
@@ -91,15 +99,36 @@ def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]
     return context, [i for i in range(start, start + run) if i not in context]
 
 
-def read(
-    name: str,
-    contexts: int,
-    frames: int,
-    size: tuple[int, int],
-    sweep,
-    convention: str | None = None,
-) -> dict[str, Any]:
-    """One scene at generation size: rgb [v, h, w, 3], K, c2w (float64), contexts first, and depth or None."""
+def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[int], list[int]]]:
+    """(context ids, the target alone) of up to `count` views, evenly over all: the views nearest to each, nearest first.
+
+    c2w [v, 4, 4]; near as `metrics.baselines.view_distances` has it.
+    """
+    from .metrics.baselines import view_distances
+
+    if len(c2w) <= contexts:
+        raise UserError(
+            f"{len(c2w)} views cannot give {contexts} contexts and a target: use fewer with --context."
+        )
+    found = []
+    for i in np.linspace(0, len(c2w) - 1, min(count, len(c2w))).round().astype(int).tolist():
+        others = [j for j in range(len(c2w)) if j != i]
+        order = np.argsort(view_distances(c2w[others], c2w[i]), kind="stable")
+        found.append(([others[j] for j in order[:contexts]], [i]))
+    return found
+
+
+Take = Callable[[list[int], list[int]], dict[str, Any]]
+
+
+def open_views(
+    name: str, views: int, size: tuple[int, int], sweep, convention: str | None = None
+) -> tuple[np.ndarray, Take]:
+    """The cameras c2w [v, 4, 4] of a scene (`views` of a procedural one), and what gives some of its views.
+
+    `take(context, target)` is a dict of what was asked for at generation size, contexts first: rgb [., h, w, 3], K, c2w
+    (float64), the targets' depth or None.
+    """
     from .data import scene as scenes
 
     if name.startswith("procedural:"):
@@ -107,32 +136,38 @@ def read(
 
         made = sample_sequence(
             scenes.procedural_seed(name),
-            frames=frames + contexts,
+            frames=views,
             height=size[0],
             width=size[1],
             sweep=SWEEP if sweep is None else tuple(sweep),
         )
-        context, target = spread(frames + contexts, contexts, frames)
-        order = context + target
+
+        def rendered(context: list[int], target: list[int]) -> dict[str, Any]:
+            order = context + target
+            return {
+                "rgb": made["rgb"][order].astype(np.float32) / 255.0,
+                "K": made["K"][order],
+                "c2w": made["c2w"][order],
+                "depth": made["depth"][target],
+                "context": context,
+                "target": target,
+            }
+
+        return made["c2w"], rendered
+    scene = scenes.load_scene(name, convention=convention)
+
+    def taken(context: list[int], target: list[int]) -> dict[str, Any]:
+        images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
         return {
-            "rgb": made["rgb"][order].astype(np.float32) / 255.0,
-            "K": made["K"][order],
-            "c2w": made["c2w"][order],
-            "depth": made["depth"][target],
+            "rgb": images,
+            "K": np.asarray(cameras.K),
+            "c2w": np.asarray(cameras.c2w),
+            "depth": None,
             "context": context,
             "target": target,
         }
-    scene = scenes.load_scene(name, convention=convention)
-    context, target = spread(len(scene), contexts, frames)
-    images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
-    return {
-        "rgb": images,
-        "K": np.asarray(cameras.K),
-        "c2w": np.asarray(cameras.c2w),
-        "depth": None,
-        "context": context,
-        "target": target,
-    }
+
+    return np.asarray(scene.cameras.c2w, np.float64), taken
 
 
 class Evaluator:
@@ -194,12 +229,34 @@ class Evaluator:
         }
 
 
+def samples(
+    args: argparse.Namespace, name: str, frames: int, size: tuple[int, int]
+) -> Iterator[dict[str, Any]]:
+    """What is to be shown of one scene, as `take` of `open_views` gives it: one run, or with `close` many single views."""
+    c2w, take = open_views(name, frames + args.context, size, args.sweep, args.convention)
+    if args.close is None:
+        yield take(*spread(len(c2w), args.context, frames))
+    else:
+        for context, target in neighbours(c2w, args.context, args.close):
+            yield take(context, target)
+
+
+def methods_of(
+    evaluator: Evaluator, scene: dict[str, Any], size: tuple[int, int]
+) -> dict[str, np.ndarray]:
+    """{method: [n, h, w, 3]} of the targets of one `take`: what the model makes, and what needs no learning."""
+    from .metrics.baselines import baselines
+
+    m, (K, c2w) = len(scene["context"]), (scene["K"], scene["c2w"])
+    simple, _ = baselines(scene["rgb"][:m], K[:m], c2w[:m], K[m:], c2w[m:], size, scene["depth"])
+    return evaluator.videos(scene) | simple
+
+
 def main(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
     from .metrics import image, report
-    from .metrics.baselines import baselines
 
     output_file(args.out, "--out")
     if args.sheet:
@@ -221,36 +278,29 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
             f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
         )
     for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
-        scene = read(name, args.context, config.frames, size, args.sweep, args.convention)
-        m = len(scene["context"])
-        truth = scene["rgb"][m:]
-        videos = evaluator.videos(scene)
-        simple, _ = baselines(
-            scene["rgb"][:m],
-            scene["K"][:m],
-            scene["c2w"][:m],
-            scene["K"][m:],
-            scene["c2w"][m:],
-            size,
-            scene["depth"],
-        )
-        row = {
-            "scene": Path(name).name or name,
-            "context": scene["context"],
-            "target": scene["target"],
-        }
-        for method, frames in (videos | simple).items():
-            row[method] = image.image_metrics(np.clip(frames, 0.0, 1.0), truth)
+        parts = list(samples(args, name, config.frames, size))
+        made = [methods_of(evaluator, part, size) for part in parts]
+        row: dict[str, Any] = {"scene": Path(name).name or name}
+        for key in ("context", "target"):
+            row[key] = parts[0][key] if args.close is None else [part[key] for part in parts]
+        for method in made[0]:
+            found = [
+                image.image_metrics(np.clip(frames[method], 0.0, 1.0), part["rgb"][args.context :])
+                for frames, part in zip(made, parts)
+            ]
+            row[method] = {k: float(np.mean([one[k] for one in found])) for k in found[0]}
         results.append(row)
+        methods += [method for method in made[0] if method not in methods]
+        frames, part = made[len(made) // 2], parts[len(parts) // 2]
+        photos, truth = np.split(part["rgb"], [args.context])
         middle = len(truth) // 2
-        shown = videos | simple
-        methods += [method for method in shown if method not in methods]
-        rows.append([*scene["rgb"][:m], truth[middle], *(shown[k][middle] for k in shown)])
+        rows.append([*photos, truth[middle], *(x[middle] for x in frames.values())])
     settings = {
         "checkpoint": str(args.checkpoint),
         "model": config.name,
         "size": list(size),
         "context": args.context,
+        "close": args.close,
         "frames": config.frames,
         "solver": evaluator.settings.solver,
         "steps": evaluator.settings.steps,

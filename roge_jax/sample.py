@@ -24,10 +24,8 @@ from .folders import output_folder, write_json
 
 SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
 RENDERED = 32  # views of a procedural scene
-THROUGH, ALONE = (
-    "interpolate:order=shortest",
-    "orbit:degrees=12",
-)  # paths of several photos, and of one
+THROUGH = "interpolate:order=shortest"  # the path of several photos
+ALONE = "orbit:degrees=12"  # and of one
 DTYPES = ("auto", "float32", "bfloat16")
 LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
 

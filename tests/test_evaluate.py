@@ -3,6 +3,7 @@
 import json
 
 import jax
+import numpy as np
 import pytest
 
 from roge_jax import entry, evaluate
@@ -72,9 +73,38 @@ def test_contexts_are_spread_and_targets_are_the_rest():
         evaluate.spread(3, 3, 17)
 
 
+def test_close_views_are_shown_from_their_nearest_photos(tiny, tmp_path):
+    out = tmp_path / "results.json"
+    words = ["--checkpoint", tiny, "--scenes", "procedural:1000000000", "--context", 2]
+    words += ["--close", 3, "--steps", 2, "--out", out]
+    evaluate.main(evaluate.parser().parse_args([str(w) for w in words]))
+    (row,) = json.loads(out.read_text())["scenes"]
+    last = preset("tiny").frames + 1
+    assert row["target"] == [[0], [round(last / 2)], [last]]
+    for (i,), context in zip(row["target"], row["context"], strict=True):
+        assert len(set(context) - {i}) == 2 and all(abs(j - i) <= 2 for j in context)
+    words[words.index("--close") + 1] = 1
+    evaluate.main(evaluate.parser().parse_args([str(w) for w in words]))
+    (first,) = json.loads(out.read_text())["scenes"]
+    assert first["target"] == [[0]] and first["plane"]["psnr"] != row["plane"]["psnr"]
+
+
+def test_neighbours_are_near_in_place_and_direction():
+    c2w = np.tile(np.eye(4), (5, 1, 1))
+    c2w[:, 0, 3] = [0.0, 1.0, 2.1, 3.5, 8.0]
+    found = dict((target[0], context) for context, target in evaluate.neighbours(c2w, 2, 9))
+    assert found == {0: [1, 2], 1: [0, 2], 2: [1, 3], 3: [2, 1], 4: [3, 2]}
+    c2w[1, :3, :3] = np.diag([-1.0, 1.0, -1.0])  # looks the other way
+    found = dict((target[0], context) for context, target in evaluate.neighbours(c2w, 2, 9))
+    assert found[0] == [2, 3] and found[2] == [3, 0]
+    with pytest.raises(UserError, match="--context"):
+        evaluate.neighbours(c2w, 5, 3)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["--close", "0"], "'0' is not a whole number of at least 1"),
         (["--context", "0"], "'0' is not a whole number of at least 1"),
         (["--steps", "-1"], "'-1' is not a whole number of at least 1"),
         (["--sweep", "nan", "5"], "'nan' is not a number"),

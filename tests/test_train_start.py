@@ -185,7 +185,10 @@ class TestRoom:
         monkeypatch.setattr(folders.shutil, "disk_usage", lambda _: usage._replace(free=10_000_000))
         words = ["tiny", "--devices", 1, "--save-every", 1]
         said = refused(tmp_path, capsys, *words, "--steps", 9)
-        assert "checkpoints, models, encoded samples) needs 0.0" in said and "where 0.01 GB are free" in said
+        assert (
+            "checkpoints, models, encoded samples) needs 0.0" in said
+            and "where 0.01 GB are free" in said
+        )
         cfg = config.preset("tiny")
         for steps, fits in ((1, True), (3, False)):  # one checkpoint is kept, or three
             stage = dataclasses.replace(lora(cfg), steps=steps)
