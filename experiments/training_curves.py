@@ -1,6 +1,7 @@
 """Losses and held-out results of the stages that made a model, from the logs that `train` wrote, as one small file and chart.
 
     python experiments/training_curves.py LABEL=runs/x/recon LABEL=runs/x/lookup ...
+    python experiments/training_curves.py --add LABEL=runs/y/lookup        those behind the stored ones
     python experiments/training_curves.py --draw        the chart again, from results/training_curves.json
 
 Folders in the order of training, each with the log.jsonl of one stage; panels are the stages, by the folders' names.
@@ -82,12 +83,14 @@ def main() -> None:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     p.add_argument("folders", nargs="*", metavar="LABEL=FOLDER")
     p.add_argument("--draw", action="store_true", help="only the chart, from the stored numbers")
+    p.add_argument("--add", action="store_true", help="keep the stored runs, and add these")
     args = p.parse_args()
     stored = RESULTS / "training_curves.json"
-    if args.draw == bool(args.folders):
+    if args.draw == bool(args.folders) or (args.draw and args.add):
         p.error("give the folders of the stages, or --draw")
     if args.folders:
-        runs = collect(args.folders)
+        before = json.loads(stored.read_text())["runs"] if args.add else []
+        runs = before + collect(args.folders)
         text = ",\n".join(json.dumps(run) for run in runs)
         stored.write_text(f'{{"runs": [\n{text}\n]}}\n')
     draw(json.loads(stored.read_text())["runs"], RESULTS / "training_curves.png")

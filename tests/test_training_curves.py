@@ -30,6 +30,21 @@ def test_rows_are_means_and_lose_no_held_out_result(tmp_path):
     assert (tmp_path / "chart.png").stat().st_size > 5000
 
 
+def test_runs_are_added_behind_the_stored_ones(tmp_path, monkeypatch):
+    monkeypatch.setattr(curves, "RESULTS", tmp_path)
+    monkeypatch.setattr(curves, "draw", lambda runs, file: None)
+    folder = tmp_path / "lookup"
+    folder.mkdir()
+    (folder / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n')
+    for words in (["a"], ["--add", "b"], ["c"]):
+        monkeypatch.setattr(sys, "argv", ["curves", *words[:-1], f"{words[-1]}={folder}"])
+        curves.main()
+        runs = json.loads((tmp_path / "training_curves.json").read_text())["runs"]
+        assert [run["label"] for run in runs] == {"a": ["a"], "b": ["a", "b"], "c": ["c"]}[
+            words[-1]
+        ]
+
+
 def test_the_shipped_models_stages_are_there():
     runs = json.loads((curves.RESULTS / "training_curves.json").read_text())["runs"]
     recipe = json.loads((ROOT / "roge_jax" / "assets" / "mini" / "config.json").read_text())
