@@ -18,7 +18,7 @@ from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAECon
 from .core import sharding
 from .core.attention import SCORES_BYTES
 from .core.params import flatten
-from .recon.lookup import ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
+from .recon.lookup import AGREED, ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
 from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
 from .video.dit import FLOAT32_LEAVES
@@ -91,10 +91,11 @@ def lookup(cfg: RendererConfig, height: int, width: int, m: int, views: int) -> 
     pixels, c, fine = height * width, WIDTH, FINE
     cells = pixels // CELL**2
     rays = pixels // cfg.patch**2
-    coarse = (MATCHED + 6 + c) * c + BLOCKS * (9 + ALONG) * c * c + c
+    coarse = (MATCHED + 6 + c + AGREED) * c + BLOCKS * (9 + ALONG) * c * c + c
+    around = cfg.lookup + 2 * (height + width) // CELL  # the rays' word between cuts; regions
     per_view = (
         rays * cfg.width * (cfg.patch // CELL) ** 2 * (cfg.lookup + c)
-        + cells * (cfg.lookup * coarse + 2 * c * 9 * CELL**2)
+        + cells * (cfg.lookup * (coarse + around) + 2 * c * 9 * CELL**2)
         + pixels * 9 * (8 * fine * c + c * c + c * fine)
         + pixels * 9 * (14 * c + c * c + 4 * c)
         + m * pixels * 9 * (11 * c + c)
@@ -349,9 +350,10 @@ def estimate(
     features = 4.0 * (m + n) * rays * r.width
     chunked = decoder_tensor_bytes(config) > SINGLE_PASS_BYTES
     maps = MAPS * decoder_tensor_bytes(config, 4 if chunked else n)
-    # Four neighbours of every sample, their mixture and its square: of two levels, the larger one.
-    cells = size[0] * size[1] // CELL**2
-    fetched = 24.0 * n * m * max(r.lookup * cells * (MATCHED + 3), 3 * FINE * size[0] * size[1])
+    # Four neighbours of every sample, their mixture and its square: of three levels, the largest one.
+    pixels = size[0] * size[1]
+    levels = r.lookup * (MATCHED + 3) / CELL**2, r.lookup * 3 * 4 / CELL**2, 3 * FINE
+    fetched = 24.0 * n * m * pixels * max(levels)
     working = {
         "encode photos (VAE)": MAPS * decoder_tensor_bytes(config, m),
         "reconstruct": scores(seen, seen, e.heads) + 4.0 * seen * 10 * e.width,
