@@ -17,7 +17,7 @@ from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import ViewConfig
 from roge_jax.errors import UserError
 from roge_jax.metrics import baselines
-from roge_jax.recon import lookup
+from roge_jax.recon import lookup, sweep
 from roge_jax.recon.picture import decode_all
 from roge_jax.training import stages
 
@@ -75,10 +75,10 @@ def look(p, photos, seen_by, of, *, features=None, head=None):
 def test_rays_meet_the_photos_where_the_homography_of_their_depth_says(depth):
     photos = RNG.random((2, H, W, 3)).astype(np.float32)
     seen_by, of = cameras(2, seed=3), cameras(1, seed=4)
-    way = lookup.motion(*of, *seen_by)
-    way = lookup.Motion(way.turn[0], way.shift[0])
+    way = sweep.motion(*of, *seen_by)
+    way = sweep.Motion(way.turn[0], way.shift[0])
     inverse = jnp.full((1, H * W), 1 / depth)
-    found, seen = lookup.fetch(jnp.asarray(photos), way, lookup._pixels(H, W, 1), inverse)
+    found, seen = sweep.fetch(jnp.asarray(photos), way, sweep.pixels_of(H, W, 1), inverse)
     for i in range(2):
         want = baselines.warp(
             photos[i], seen_by[0][i], seen_by[1][i], of[0][0], of[1][0], np.full((H, W), depth)
@@ -97,15 +97,15 @@ def test_the_photos_agree_at_the_true_depth_and_nowhere_else():
     c2w[:, :3, :3] = np.eye(3)  # parallel: the plane has one depth in every view
     c2w[:, 2, 3] = 0.0
     cut = 8
-    depth = 1.0 / float(lookup.inverse_depth(jnp.float32(cut), CUTS))
+    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(cut), CUTS))
     photos = textured_plane(K, c2w, depth)
-    way = lookup.motion(K[:1], c2w[:1], K[1:], c2w[1:])
-    way = lookup.Motion(way.turn[0], way.shift[0])
+    way = sweep.motion(K[:1], c2w[:1], K[1:], c2w[1:])
+    way = sweep.Motion(way.turn[0], way.shift[0])
     inverse = jnp.broadcast_to(
-        lookup.inverse_depth(jnp.arange(CUTS, dtype=jnp.float32), CUTS)[:, None], (CUTS, H * W)
+        sweep.inverse_depth(jnp.arange(CUTS, dtype=jnp.float32), CUTS)[:, None], (CUTS, H * W)
     )
-    values, seen = lookup.fetch(jnp.asarray(photos[1:]), way, lookup._pixels(H, W, 1), inverse)
-    mean, deviation, n = lookup.agreement(values, seen)
+    values, seen = sweep.fetch(jnp.asarray(photos[1:]), way, sweep.pixels_of(H, W, 1), inverse)
+    mean, deviation, n = sweep.agreement(values, seen)
     both = np.asarray(n[cut, :, 0]) == 2
     assert both.mean() > 0.3
     assert np.mean(np.asarray(deviation.mean(-1)).argmin(0)[both] == cut) > 0.95
@@ -122,23 +122,23 @@ def side_by_side(n: int, apart: float):
     return K, c2w
 
 
-def way_of(seen_by, of, side: int) -> lookup.Motion:
-    """From the one view `of` to photos that are `side` times smaller."""
-    way = lookup.motion(*of, *seen_by)
-    return lookup._in_pixels_of(lookup.Motion(way.turn[0], way.shift[0]), side)
+def way_of(seen_by, of) -> sweep.Motion:
+    """From the one view `of` to the photos."""
+    way = sweep.motion(*of, *seen_by)
+    return sweep.Motion(way.turn[0], way.shift[0])
 
 
 def reach_of(seen_by, of, cuts: int = 48) -> float:
-    way = way_of(seen_by, of, lookup.CELL)
     size = (H // lookup.CELL, W // lookup.CELL)
-    return float(lookup.shared_reach(way, lookup.twins(jnp.asarray(seen_by[1])), size, cuts))
+    alike = sweep.twins(jnp.asarray(seen_by[1]))
+    return float(sweep.shared_reach(way_of(seen_by, of), alike, size, lookup.CELL, cuts))
 
 
 def test_the_cuts_end_where_two_photos_no_longer_see_the_same():
     def nearest(apart):
         K, c2w = side_by_side(3, apart)
         photos, view = (K[::2], c2w[::2]), (K[1:2], c2w[1:2])
-        return 1.0 / float(lookup.inverse_depth(jnp.float32(47), 48, reach_of(photos, view)))
+        return 1.0 / float(sweep.inverse_depth(jnp.float32(47), 48, reach_of(photos, view)))
 
     # Of parallel photos 2 b apart, both see a tenth of the view between them up to z = 40 b / (0.45 * 48).
     for apart in (0.4, 0.8, 1.6):
@@ -164,12 +164,12 @@ def test_a_shorter_axis_asks_the_rays_about_its_own_depths():
     around = jnp.zeros((CUTS, ch, cw, lookup.AGREED))
     maps = jnp.zeros((2, ch, cw, lookup.MATCHED + 3))
     K, c2w = side_by_side(3, 0.0)
-    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]), lookup.CELL)
+    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]))
     found = {}
     for reach in (1.0, 0.6):
         out = lookup._coarse(p, maps, jnp.eye(2), way, reach, prior, nothing[0], nothing[1], around)
-        found[reach] = np.asarray(lookup.inverse_depth(out[1], CUTS, reach))
-    want = float(lookup.inverse_depth(jnp.float32(favoured), CUTS))
+        found[reach] = np.asarray(sweep.inverse_depth(out[1], CUTS, reach))
+    want = float(sweep.inverse_depth(jnp.float32(favoured), CUTS))
     np.testing.assert_allclose(found[1.0], want, rtol=1e-3)
     np.testing.assert_allclose(found[0.6], want, rtol=0.05)
 
@@ -179,11 +179,11 @@ def test_cells_learn_from_their_surroundings_and_the_view_where_photos_agree():
     depth = 2.0
     photos = textured_plane(K, c2w, depth)
     photos[:, :12, :16] = 0.4  # a corner without texture
-    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]), 2)
+    way = way_of((K[::2], c2w[::2]), (K[1:2], c2w[1:2]))
     halves, cuts, reach = lookup._cells(jnp.asarray(photos[::2]), 2), 48, 0.5
     told = np.asarray(lookup._agreement_around(halves, jnp.eye(2), way, jnp.float32(reach), cuts))
     assert told.shape == (cuts, H // 4, W // 4, lookup.AGREED) and np.isfinite(told).all()
-    inverse = np.asarray(lookup.inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach))
+    inverse = np.asarray(sweep.inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach))
     right = int(np.abs(inverse - 1 / depth).argmin())
     near = {right - 1, right, right + 1}
     own, region, _, view, view_seen = np.moveaxis(told, -1, 0)
@@ -236,11 +236,11 @@ def test_repeated_photos_change_nothing():
 
 def test_photos_become_witnesses_of_their_own_as_they_part():
     c2w = np.tile(np.eye(4, dtype=np.float32), (3, 1, 1))
-    c2w[:, 0, 3] = 0.0, 0.5 * lookup.APART, 2.0
-    alike = lookup.twins(jnp.asarray(c2w))
+    c2w[:, 0, 3] = 0.0, 0.5 * sweep.APART, 2.0
+    alike = sweep.twins(jnp.asarray(c2w))
     np.testing.assert_allclose(alike, [[1, 0.5, 0], [0.5, 1, 0], [0, 0, 1]], atol=1e-6)
     seen = jnp.asarray([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 1.0]])  # three cuts
-    found = lookup.witnesses(seen, alike)
+    found = sweep.witnesses(seen, alike)
     np.testing.assert_allclose(found, [[2 / 3, 1, 0], [2 / 3, 0, 0], [1, 1, 1]], rtol=1e-6)
 
 

@@ -30,20 +30,30 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
+from .sweep import (
+    EPS,
+    SHARED,
+    Motion,
+    agreement,
+    all_cuts,
+    fetch,
+    in_pixels_of,
+    inverse_depth,
+    motion,
+    pixels_of,
+    shared_reach,
+    twins,
+    witnesses,
+)
 
 CELL = 4  # pixels, along both axes
-NEAREST = 0.25  # depth of the last cut in the normalised scene; the first is at infinity
-SPACING = 1.5  # exponent: cuts are denser towards infinity
 BLOCKS, WIDTH, MATCHED = 3, 16, 8  # coarse network; channels of the photos' features
 FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
 ALONG = 5  # neighbouring cuts that a coarse block sees
-SHARED = 0.1  # of a view's cells: cuts that two photos see in fewer of them are not looked at
 REGION = 3.0  # standard deviation of a cell's region, in cells
 AGREED = 5  # what a cell is told of the agreement of colours (`_agreement_around`)
+UNKNOWN = 0.3  # deviation of colours that no two photos show
 UNSEEN = -8.0  # logit of cuts that no photo sees
-BEHIND = 1e-3  # depths in a photo below this are behind it
-APART = 0.05  # distance in the normalised scene from which photos are witnesses of their own
-EPS = 1e-5
 
 
 class Looked(NamedTuple):
@@ -88,132 +98,15 @@ def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
     }
 
 
-class Motion(NamedTuple):
-    """From a view's homogeneous pixel x at inverse depth w to a photo's: turn @ x + w * shift."""
-
-    turn: jax.Array  # [v, m, 3, 3]
-    shift: jax.Array  # [v, m, 3]
-
-
-def motion(K: jax.Array, c2w: jax.Array, photo_K: jax.Array, photo_c2w: jax.Array) -> Motion:
-    """`Motion` from v views to m photos: K [., 3, 3] in pixels, c2w [., 4, 4]; depth is z of the view."""
-    with jax.default_matmul_precision("highest"):
-        inverse = jnp.swapaxes(photo_c2w[:, :3, :3], 1, 2)
-        turn = jnp.einsum("mij,vjk->vmik", inverse, c2w[:, :3, :3])
-        apart = c2w[:, None, :3, 3] - photo_c2w[None, :, :3, 3]
-        turn = jnp.einsum("mij,vmjk,vkl->vmil", photo_K, turn, jnp.linalg.inv(K))
-        return Motion(turn, jnp.einsum("mij,mjk,vmk->vmi", photo_K, inverse, apart))
-
-
-def inverse_depth(cut: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> jax.Array:
-    """1 / depth of a cut, a number between 0 and `cuts` - 1 that need not be whole.
-
-    The cuts divide the share `reach` of an axis that begins at infinity and ends at `NEAREST`.
-    """
-    return (jnp.maximum(reach * cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
-
-
-def shared_reach(way: Motion, alike: jax.Array, size: tuple[int, int], cuts: int) -> jax.Array:
-    """The share (0, 1] of the axis of `inverse_depth` on which photos from two places see what one view sees.
-
-    `way`: the view's motion in cells of the photos, which have `size` of them. Photos close together, against the depth of the scene, have
-    all of it within a few of the cuts of a whole axis. 1 where no two photos see the same.
-    """
-    numbers = jnp.arange(cuts, dtype=jnp.float32)
-    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts)[:, None], (cuts, size[0] * size[1]))
-    _, _, seen = meet(way, _pixels(*size, CELL), inverse, size)
-    shared = (witnesses(seen, alike).sum(0) > 1.5).mean(-1) > SHARED
-    last = jnp.max(jnp.where(shared, numbers, -1.0))
-    reach = jnp.minimum(last + 2.0, cuts - 1.0) / (cuts - 1.0)
-    return jax.lax.stop_gradient(jnp.where(last < 0.0, 1.0, reach))
-
-
-def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, int]):
-    """Where one view's rays meet their cuts in m images of `size`: (x, y, seen), each [m, k, p].
-
-    `way`: the view's motion in pixels of the images; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. A cut is
-    seen (1, else 0) if it lies in front of the photo and inside its frame.
-    """
-    h, w = size
-    ones = jnp.ones((len(pixels), 1))
-    start = jnp.einsum("mij,pj->mpi", way.turn, jnp.concatenate([pixels, ones], -1))
-    q = start[:, None] + inverse[None, :, :, None] * way.shift[:, None, None]
-    front = q[..., 2] > BEHIND
-    z = jnp.where(front, q[..., 2], 1.0)
-    x, y = (jnp.where(front, q[..., i] / z, -1.0) for i in (0, 1))
-    seen = front & (x >= 0) & (y >= 0) & (x <= w) & (y <= h)
-    return x, y, seen.astype(jnp.float32)
-
-
-def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
-    """Values of m images [m, h, w, c] where one view's rays meet their cuts: ([m, k, p, c], seen [m, k, p]), as by `meet`.
-
-    Bilinear, border repeated.
-    """
-    m, h, w, _ = images.shape
-    x, y, seen = meet(way, pixels, inverse, (h, w))
-    x, y = jnp.clip(x - 0.5, 0.0, w - 1.001), jnp.clip(y - 0.5, 0.0, h - 1.001)
-    left, top = jnp.floor(x), jnp.floor(y)
-    fx, fy = (x - left)[..., None], (y - top)[..., None]
-    # A row holds the four neighbours of a sample: one gather instead of four.
-    corners = [images[:, i : h - 1 + i, j : w - 1 + j] for i in (0, 1) for j in (0, 1)]
-    quads = jnp.concatenate(corners, -1).reshape(m * (h - 1) * (w - 1), -1)
-    first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
-    index = (top * (w - 1) + left).astype(jnp.int32) + first[:, None, None]
-    a, b, c, d = jnp.split(quads.at[index].get(mode="promise_in_bounds"), 4, -1)
-    upper, lower = a + fx * (b - a), c + fx * (d - c)
-    return upper + fy * (lower - upper), seen
-
-
-def twins(photo_c2w: jax.Array) -> jax.Array:
-    """How much two photos were taken from one place [m, m]: 1 there, 0 from `APART` on.
-
-    Photos from one place agree at every depth, so that together they are worth one (`witnesses`).
-    """
-    centres = jax.lax.stop_gradient(photo_c2w[:, :3, 3])
-    apart = jnp.sqrt(jnp.square(centres[:, None] - centres[None]).sum(-1))
-    return jnp.clip(1.0 - apart / APART, 0.0, 1.0)
-
-
-def witnesses(seen: jax.Array, alike: jax.Array) -> jax.Array:
-    """`seen` [m, ..] between 0 and 1, shared among those that see the same from the same place (`twins`)."""
-    return jnp.square(seen) / jnp.maximum(jnp.tensordot(alike, seen, 1), EPS)
-
-
-def agreement(values: jax.Array, weight: jax.Array):
-    """Mean and standard deviation over the photos that see a cut, and their number: values [m, .., c], weight [m, ..]
-    as by `witnesses`.
-
-    Fewer than two photos agree on nothing: their deviation is that of strangers.
-    """
-    n = weight.sum(0)[..., None]
-    share = weight[..., None] / jnp.maximum(n, EPS)[None]
-    mean = (values * share).sum(0)
-    variance = (jnp.square(values - mean[None]) * share).sum(0) * n / jnp.maximum(n - 1.0, 1.0)
-    return mean, jnp.sqrt(jnp.where(n > 1.5, variance, 0.1) + 1e-4), n
-
-
 def _counts(n: jax.Array) -> list[jax.Array]:
     """Whether a photo sees it, and whether two from different places do."""
     return [(n > 0.5).astype(jnp.float32), (n > 1.5).astype(jnp.float32)]
-
-
-def _pixels(h: int, w: int, step: int) -> jax.Array:
-    """Centres [h * w, 2] = (x, y) of cells of `step` pixels."""
-    y, x = np.mgrid[:h, :w] * step + 0.5 * step
-    return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
 
 
 def _cells(images: jax.Array, side: int = CELL) -> jax.Array:
     """Means of cells: [v, h, w, c] -> [v, h / side, w / side, c]."""
     v, h, w, c = images.shape
     return images.reshape(v, h // side, side, w // side, side, c).mean((2, 4))
-
-
-def _in_pixels_of(way: Motion, side: int) -> Motion:
-    """`way` in pixels of images that are `side` times smaller."""
-    shrink = jnp.asarray([1 / side, 1 / side, 1.0])
-    return Motion(shrink[None, :, None] * way.turn, shrink[None] * way.shift)
 
 
 @jax.named_scope("look_up")
@@ -244,11 +137,10 @@ def look_up(
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
-        small = _in_pixels_of(way, CELL)
-        reach = shared_reach(small, alike, maps.shape[1:3], cuts)
-        around = _agreement_around(halves, alike, _in_pixels_of(way, CELL // 2), reach, cuts)
+        reach = shared_reach(way, alike, maps.shape[1:3], CELL, cuts)
+        around = _agreement_around(halves, alike, way, reach, cuts)
         coarse, cut, sure, hidden = _coarse(
-            p, maps, alike, small, reach, prior, context, _cells(head[None])[0], around
+            p, maps, alike, way, reach, prior, context, _cells(head[None])[0], around
         )
         weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
         cut, sure = (_upsampled(weights, x) for x in (cut, sure))
@@ -281,16 +173,15 @@ def _agreement_around(halves: jax.Array, alike, way: Motion, reach, cuts: int) -
     where its surroundings lie.
     """
     _, h, w, _ = halves.shape
-    numbers = jnp.arange(cuts, dtype=jnp.float32)
-    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts, reach)[:, None], (cuts, h * w))
-    values, seen = fetch(halves, way, _pixels(h, w, CELL // 2), inverse)
+    way, where = in_pixels_of(way, CELL // 2), pixels_of(h, w, CELL // 2)
+    values, seen = fetch(halves, way, where, all_cuts(cuts, h * w, reach))
     _, deviation, n = agreement(values, witnesses(seen, alike))
     both = (n > 1.5).astype(jnp.float32)
     sums = jnp.concatenate([deviation.mean(-1, keepdims=True) * both, both], -1)
-    sums = _cells(
-        sums.reshape(cuts, h, w, 2), 2
-    )  # of a cell: deviation where two photos see it, and how much
-    told = [jnp.where(sums[..., 1] > 0, sums[..., 0] / jnp.maximum(sums[..., 1], EPS), 0.3)]
+    # Of a cell: the deviation where two photos see it, and how much of it they see.
+    sums = _cells(sums.reshape(cuts, h, w, 2), 2)
+    own = sums[..., 0] / jnp.maximum(sums[..., 1], EPS)
+    told = [jnp.where(sums[..., 1] > 0, own, UNKNOWN)]
     rows, columns = _region(h // 2), _region(w // 2)
     region = jnp.einsum("ij,kjlc,ml->kimc", rows, sums, columns)
     whole = jnp.broadcast_to(sums.mean((1, 2), keepdims=True), sums.shape)
@@ -312,15 +203,15 @@ def _region(n: int) -> np.ndarray:
 
 def _coarse(p: Tree, maps, alike, way: Motion, reach, prior, context, head, around):
     """One view's distribution over the cuts of a cell, from prior [ch, cw, k], context [ch, cw, c] and the agreement of
-    colours [k, ch, cw, 5]; `way` in cells.
+    colours around it [k, ch, cw, 5].
 
     Returns the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there [ch, cw], and the hidden
     state [ch, cw, c].
     """
     ch, cw, cuts = prior.shape
     numbers = jnp.arange(cuts, dtype=jnp.float32)
-    inverse = jnp.broadcast_to(inverse_depth(numbers, cuts, reach)[:, None], (cuts, ch * cw))
-    values, seen = fetch(maps, way, _pixels(ch, cw, CELL), inverse)
+    way, where = in_pixels_of(way, CELL), pixels_of(ch, cw, CELL)
+    values, seen = fetch(maps, way, where, all_cuts(cuts, ch * cw, reach))
     agreed = agreement(values, witnesses(seen, alike))
     mean, deviation, n = (x.reshape(cuts, ch, cw, -1) for x in agreed)
     # The rays speak of the cuts of the whole axis: between two of them, in proportion.
@@ -361,7 +252,7 @@ def _fine(p: Tree, photos, alike, cuts: int, way: Motion, reach, cut, head):
     h, w = cut.shape
     offsets = jnp.asarray((np.arange(FINE) - (FINE - 1) / 2) / 4, jnp.float32)
     inverse = inverse_depth(offsets[:, None] + cut.reshape(1, -1), cuts, reach)
-    values, seen = fetch(photos, way, _pixels(h, w, 1), inverse)
+    values, seen = fetch(photos, way, pixels_of(h, w, 1), inverse)
     agreed = agreement(values, witnesses(seen, alike))
     mean, deviation, n = (x.reshape(FINE, h, w, -1) for x in agreed)
     y = jnp.concatenate([deviation, jnp.abs(mean - head[None]), *_counts(n)], -1)
