@@ -391,10 +391,6 @@ def test_the_planner_predicts_on_scenes_that_it_never_saw(unseen):
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="on an easy plane the planner expects three times the error that comes, and spends more than it need",
-)
 def test_the_planner_expects_no_more_than_three_times_the_error(unseen):
     predicted, realised = np.concatenate(unseen, 1)
     assert np.quantile(realised / predicted, 0.1) > 1 / 3

@@ -1,0 +1,56 @@
+"""The shipped weights: their reconstruction is ahead of what needs no learning, on photos far apart and close together."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from roge_jax import checkpoint, evaluate, model
+from roge_jax.data.views import make_sample
+from roge_jax.metrics.baselines import baselines
+from roge_jax.metrics.image import image_metrics
+
+
+@functools.cache
+def shipped():
+    params, config = checkpoint.load_model("mini")
+
+    @jax.jit
+    def picture(params, views):
+        tokens = model.reconstruct(params, views, config=config)
+        features = model.query_rays(params, tokens, views, config=config)
+        return model.show(params, features, views, config=config)
+
+    return params, config, picture
+
+
+def gains(samples) -> tuple[float, float]:
+    """(dB above the plane at the true median depth, sharpness where the truth has 1), means over the samples."""
+    params, config, picture = shipped()
+    rows = []
+    for scene in samples:
+        m, (K, c2w) = len(scene["context"]), (scene["K"], scene["c2w"])
+        views = make_sample(scene["rgb"], K, c2w, m, scale_rule=config.scale_rule)
+        truth = views.pop("target_rgb")
+        shown = image_metrics(np.asarray(picture(params, views)), truth)
+        simple, _ = baselines(
+            scene["rgb"][:m], K[:m], c2w[:m], K[m:], c2w[m:], truth.shape[1:3], scene["depth"]
+        )
+        plane = image_metrics(np.clip(simple["plane"], 0.0, 1.0), truth)
+        rows.append((shown["psnr"] - plane["psnr"], shown["sharpness_ratio"]))
+    return tuple(np.mean(rows, 0))
+
+
+@pytest.mark.parametrize("close", [False, True])
+def test_the_reconstruction_is_ahead_of_the_plane(close):
+    size, samples = (64, 112), []
+    for seed in (1000000010, 1000000011):
+        c2w, take = evaluate.open_views(f"procedural:{seed}", 20, size, None)
+        if close:
+            samples += [take(*one) for one in evaluate.neighbours(c2w, 2, 3)]
+        else:
+            context, target = evaluate.spread(20, 3, 17)
+            samples.append(take(context, target[::4]))
+    above, sharpness = gains(samples)
+    assert above > (1.2 if close else 2.5) and sharpness > 0.5
