@@ -362,7 +362,7 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
     from .sampling import context_ids, noise_levels, read_photos
 
     scene = scene or load_scene(args.scene, convention=args.convention)
-    photos = read_photos(scene, context_ids(args.context, scene, config.max_context), config)
+    photos = read_photos(scene, context_ids(args.context, scene, config), config)
     path = camera_path(args, photos.cameras, config)
     normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
     noise_levels(settings, config)

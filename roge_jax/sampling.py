@@ -27,6 +27,7 @@ from .choices import Choices, Planned, around, spans
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
+from .data.overlap import select_overlapping
 from .data.scene import Scene, distinct_views, select_context
 from .data.scene import prepare as prepare_photos
 from .errors import UserError, did_you_mean
@@ -115,10 +116,11 @@ class Result:
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
-def context_ids(text: str | None, scene: Scene, most: int) -> list[int]:
-    """The views that --context asks for: how many, or which by number or name; a model takes `most`."""
+def context_ids(text: str | None, scene: Scene, config: RoGeConfig) -> list[int]:
+    """The views that --context asks for: how many, or which by number or name; without a word, up to 6."""
+    most = config.max_context
     if text is None:
-        return select_context(scene, min(len(scene), most, DEFAULT_CONTEXT))
+        return _chosen(scene, min(len(scene), most, DEFAULT_CONTEXT), config)
     words = [word.strip() for word in text.split(",")]
     if any(words) and ("," in text or text in scene.names):
         return [_view(word, scene) for word in words if word]
@@ -127,7 +129,14 @@ def context_ids(text: str | None, scene: Scene, most: int) -> list[int]:
             f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
             f"model takes {most}), or photos by number or name, separated by commas."
         )
-    return select_context(scene, int(text))
+    return _chosen(scene, int(text), config)
+
+
+def _chosen(scene: Scene, count: int, config: RoGeConfig) -> list[int]:
+    """So many photos of a scene that hang together; all of them where there are no more."""
+    if count in (1, len(scene)):
+        return select_context(scene, count)
+    return select_overlapping(scene, count, config.height, config.width)
 
 
 def _view(word: str, scene: Scene) -> int:

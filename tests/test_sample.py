@@ -368,7 +368,8 @@ def test_defaults_are_the_contract():
     ],
 )
 def test_context_words(text, ids, place):
-    assert sampling.context_ids(text, load_scene(place / "scene"), 9) == ids
+    config = dataclasses.replace(CONFIG, max_context=9)
+    assert sampling.context_ids(text, load_scene(place / "scene"), config) == ids
 
 
 def test_the_path_goes_through_the_photos_and_around_a_single_one(photos):

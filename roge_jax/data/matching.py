@@ -164,15 +164,28 @@ def photo_matches(
     found = {view: seen(view) for view in sorted({view for pair in pairs for view in pair})}
     matches: Matches = {}
     for i, j in pairs:
-        both = matched_features(found[i][0], found[j][0])
-        if both is None:
-            continue
-        moved = [_cropped(x, found[v][1], height, width) for x, v in zip(both, (i, j), strict=True)]
-        inside = [((x > 0) & (x < (width, height))).all(1) for x in moved]
-        keep = inside[0] & inside[1]
-        if keep.sum() >= MIN_MATCHES:
-            matches[i, j] = (moved[0][keep], moved[1][keep])
+        both = matches_inside(found[i], found[j], height, width)
+        if both is not None:
+            matches[i, j] = both
     return matches
+
+
+Seen = tuple[Features | None, tuple[int, int]]  # of a picture, and its size
+
+
+def matches_inside(
+    one: Seen, other: Seen, height: int, width: int
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Matched pixels [p, 2] of the height x width pictures that `crop_resize` makes of two photos, or None if fewer than
+    20 lie inside both.
+    """
+    both = matched_features(one[0], other[0])
+    if both is None:
+        return None
+    moved = [_cropped(x, seen[1], height, width) for x, seen in zip(both, (one, other))]
+    inside = [((x > 0) & (x < (width, height))).all(1) for x in moved]
+    keep = inside[0] & inside[1]
+    return (moved[0][keep], moved[1][keep]) if keep.sum() >= MIN_MATCHES else None
 
 
 def _cropped(x: np.ndarray, source: tuple[int, int], height: int, width: int) -> np.ndarray:

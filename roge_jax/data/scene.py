@@ -31,7 +31,15 @@ from roge_jax.geometry.cameras import (
 )
 from roge_jax.geometry.validation import Finding
 
-__all__ = ["Scene", "distinct_views", "load_scene", "open_scene", "prepare", "select_context"]
+__all__ = [
+    "Scene",
+    "distinct_views",
+    "load_scene",
+    "open_scene",
+    "prepare",
+    "select_context",
+    "view_gaps",
+]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,13 +341,30 @@ def distinct_views(images: Sequence[np.ndarray] | np.ndarray, cameras: Cameras) 
     return kept
 
 
+def view_gaps(cameras: Cameras) -> np.ndarray:
+    """How different what two views see is, [v, v], for `select_context`: their distance over the largest one and their
+    angle over the largest one, added in squares.
+    """
+    apart = np.linalg.norm(cameras.centres[:, None] - cameras.centres[None], axis=-1)
+    rotations = cameras.c2w[:, :3, :3]
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    angles = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
+    # What is only rounding (of positions, and of arccos near 1) must not be scaled up to 1.
+    limits = (1e-12 * np.abs(cameras.centres).max(), 1e-6)
+    return np.sqrt(
+        sum(
+            (gap / gap.max()) ** 2 if gap.max() > limit else 0.0 * gap
+            for gap, limit in zip((apart, angles), limits, strict=True)
+        )
+    )
+
+
 def select_context(
     scene: Scene | Cameras, m: int, *, first: int | None = None, among: Sequence[int] | None = None
 ) -> list[int]:
     """m views that see as much of the scene as possible: farthest-point sampling, deterministic.
 
-    The distance of two views is their distance over the largest one, and their angle over the
-    largest one, added in squares, so it depends on no unit. The first view is the most central one
+    How far apart views are says `view_gaps`, in no unit. The first view is the most central one
     unless `first` is given. `among` limits the choice. Returns indices in ascending order, except
     that `first` leads (it becomes the world frame).
     """
@@ -352,19 +377,7 @@ def select_context(
         raise UserError(f"Cannot choose {m} context views: the scene offers 1 to {len(pool)}.")
     if first is not None and first not in pool:
         raise UserError(f"View {first} cannot be the first context: it is not among the choices.")
-    chosen = cameras[pool]
-    apart = np.linalg.norm(chosen.centres[:, None] - chosen.centres[None], axis=-1)
-    rotations = chosen.c2w[:, :3, :3]
-    traces = np.einsum("aij,bij->ab", rotations, rotations)
-    angles = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
-    # What is only rounding (of positions, and of arccos near 1) must not be scaled up to 1.
-    limits = (1e-12 * np.abs(chosen.centres).max(), 1e-6)
-    distances = np.sqrt(
-        sum(
-            (gap / gap.max()) ** 2 if gap.max() > limit else 0.0 * gap
-            for gap, limit in zip((apart, angles), limits, strict=True)
-        )
-    )
+    distances = view_gaps(cameras[pool])
     start = int(np.argmin(distances.sum(0))) if first is None else pool.index(first)
     picked = [start]
     while len(picked) < m:

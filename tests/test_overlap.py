@@ -1,0 +1,59 @@
+"""Photos of a large scene: far apart, but connected; what is unreadable or shares nothing does not stop the choice."""
+
+import numpy as np
+import pytest
+
+from roge_jax import sampling
+from roge_jax.config import preset
+from roge_jax.data.overlap import select_overlapping
+from roge_jax.data.procedural import sample_sequence
+from roge_jax.data.scene import Scene, select_context
+from roge_jax.errors import UserError
+from roge_jax.geometry.cameras import Cameras
+
+SIZE = (128, 224)
+
+
+@pytest.fixture(scope="module")
+def rooms():
+    """Two rooms of 6 photos each, side by side in one frame: views 0 to 5 and 6 to 11 share nothing."""
+    images, K, c2w = [], [], []
+    for i, seed in enumerate((1000000020, 1000000024)):
+        made = sample_sequence(seed, frames=6, height=SIZE[0], width=SIZE[1], sweep=(20.0, 25.0))
+        images += [rgb / np.float32(255) for rgb in made["rgb"]]
+        moved = made["c2w"].copy()
+        moved[:, 0, 3] += 40.0 * i
+        K.append(made["K"])
+        c2w.append(moved)
+    cameras = Cameras(np.concatenate(K), np.concatenate(c2w))
+    return Scene(images, cameras, tuple(f"{i}.png" for i in range(12)), "rooms")
+
+
+def test_photos_hang_together(rooms):
+    config = preset("mini")
+    far = select_context(rooms, 3)
+    assert len({i // 6 for i in far}) == 2  # the farthest ones lie in both rooms
+    near = select_overlapping(rooms, 3, config.height, config.width)
+    assert len(set(near)) == 3 and len({i // 6 for i in near}) == 1 and near == sorted(near)
+    assert max(near) - min(near) >= 3  # far apart as long as they share something
+    assert sampling.context_ids("3", rooms, config) == near
+    assert len(sampling.context_ids(None, rooms, config)) == 6
+
+
+def test_where_nothing_is_shared_the_nearest_is_taken(rooms):
+    blank = [np.full_like(image, 0.5) for image in rooms.images]
+    scene = Scene(blank, rooms.cameras, rooms.names, "blank")
+    found = select_overlapping(scene, 4, 64, 112)
+    assert len(set(found)) == 4 and len({i // 6 for i in found}) == 1
+
+
+def test_damaged_photos_do_not_stop_the_choice(rooms):
+    class Some(list):
+        def __getitem__(self, i):
+            if i in (1, 4, 8):
+                raise UserError("cannot be read.")
+            return super().__getitem__(i)
+
+    scene = Scene(Some(rooms.images), rooms.cameras, rooms.names, "some")
+    found = select_overlapping(scene, 3, 64, 112)
+    assert len(set(found)) == 3 and not {1, 4, 8} & set(found)
