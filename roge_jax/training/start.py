@@ -18,8 +18,8 @@ from ..cost import kept_as
 from ..data.source import open_source
 from ..errors import UserError
 from ..folders import fingerprint_files, keep_settings
-from . import encoded
-from .stages import Stage, stage_batch, stage_config
+from . import encoded, stages
+from .stages import Stage, stage_config
 
 PUT_BACK = "put it back and continue with --resume, nothing that was trained is lost"
 
@@ -96,7 +96,7 @@ def samples(
     of others new samples, and None. `config` is the stage's own; `rows` of a batch are this process'.
     """
     if not stage.stored:
-        return lambda i: stage_batch(source, stage, config, seed, i, rows), None
+        return lambda i: stages.stage_batch(source, stage, config, seed, i, rows), None
     one = dataclasses.replace(stage, batch=1)
     weights = loaded({part: params[part] for part in encoded.READS})
     encode = functools.partial(
@@ -105,7 +105,7 @@ def samples(
     clips = encoded.Clips(
         folder,
         stage.stored,
-        lambda i: stage_batch(source, one, config, seed, i),
+        lambda i: stages.stage_batch(source, one, config, seed, i),
         encode,
         resume=resume,
     )
