@@ -363,6 +363,7 @@ def run_stage(args, stage, params, cfg, mesh, base: str):
     evaluate = None
     if args.evaluate_every:
         evaluate = stages.held_out(objective, frozen, stage, working, encode=encode)
+    del encode  # and with it the networks that encode
     diagnose = None
     if args.diagnose_every and stage.objective == "joint":
         from .training.diagnose import joint_diagnose

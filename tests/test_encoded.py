@@ -9,11 +9,12 @@ from test_sharding import small
 from train_runs import losses, run
 
 from roge_jax import model
-from roge_jax.core.params import flatten
+from roge_jax.config import preset
+from roge_jax.core.params import count, flatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import make_sample
 from roge_jax.errors import UserError
-from roge_jax.training import encoded, room, stages
+from roge_jax.training import encoded, estimate, loop, room, stages
 
 
 def with_preview():
@@ -62,7 +63,20 @@ def test_a_stage_trains_on_encoded_samples_and_goes_on(common, cheap, monkeypatc
 
     monkeypatch.setattr(encoded, "encode", encode)
     words = [*common, "--stage", "generator", "--encode-once", 6, "--batch", 2]
-    run(*words, "--steps", 4, "--out", tmp_path / "whole")
+    before, held, train = {id(x) for x in jax.live_arrays()}, [], loop.train
+
+    def spied(*arguments, **more):
+        held.append(sum(x.nbytes for x in jax.live_arrays() if id(x) not in before))
+        return train(*arguments, **more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "train", spied)
+        run(*words, "--steps", 4, "--out", tmp_path / "whole")
+    config = preset("tiny")
+    stage = stages.find_stage(stages.mini_stages(frames=config.frames), "generator")
+    read = stages.stage_specs(config, stages.once_encoded(stage, config, 6))
+    # The networks that encode are gone, but for the VAE of a random start, which is drawn whole.
+    assert held == [4 * (sum(map(count, read)) + count(model.specs(config)["vae"]))]
     files = sorted((tmp_path / "whole/generator/encoded").iterdir())
     assert len(files) == 6 and all(f.suffix == ".npz" for f in files)
     run(*words, "--steps", 4, "--out", tmp_path / "cut")
@@ -124,6 +138,14 @@ def test_a_stage_that_trains_what_encodes_is_refused(stage, tmp_path, capsys):
     recipe += [stages.lora_stage(1, frames=config.frames, hires=hires) for hires in (False, True)]
     able = [s.name for s in recipe if stages.can_store(s, config)]
     assert able == ["generator", "hires"]
+
+
+def test_features_that_nobody_measured_keep_their_range():
+    for config, dtype in ((small(), "float32"), (with_preview(), "float16")):
+        stage = stages.find_stage(stages.mini_stages(frames=config.frames), "generator")
+        stage = stages.once_encoded(stage, config, 4)
+        batch = estimate.abstract_batch(stages.stage_config(config, stage), stage, 2, 1)
+        assert batch["features"].dtype == dtype
 
 
 def test_an_encoded_stage_reads_the_transformer_alone():

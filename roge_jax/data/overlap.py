@@ -17,8 +17,8 @@ def select_overlapping(scene: Scene, m: int, height: int, width: int) -> list[in
     """m views that see much of the scene, each of which shares a quarter of its picture with one chosen before.
 
     As `select_context`, from the most central view outwards, the farthest one that passes; that two photos share
-    something is seen in SIFT features that match in what height x width pictures keep of them. A view that shares nothing with any is taken
-    where none passes: the nearest one. Ascending; deterministic. Takes a second or a few.
+    something is seen in SIFT features that match in what height x width pictures keep of them. Where none passes the
+    nearest view is taken. Ascending; deterministic. Takes a second or a few.
     """
     gaps = view_gaps(to_host(scene.cameras))
 

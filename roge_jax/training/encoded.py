@@ -33,7 +33,8 @@ def encode(params: Tree, views: model.Views, *, config: RoGeConfig) -> Clip:
     """What no noise level and no weight of the transformer changes of one sample (arrays of `data.views.make_sample`).
 
     Returns the latents of all slots x0 [m + s, lh, lw, 16], contexts first; standardised ray features [m + n, gh, gw, d]
-    in float16; K and c2w of all views; and, for a model with one, the latents of the preview [s, lh, lw, 16].
+    in float16, or as they are if nobody has measured them (a few channels may then be beyond its range); K and c2w of all
+    views; and, for a model with one, the latents of the preview [s, lh, lw, 16].
     """
     latents = [
         model.encode_contexts(params, views["context_rgb"], config=config),
@@ -41,11 +42,12 @@ def encode(params: Tree, views: model.Views, *, config: RoGeConfig) -> Clip:
     ]
     tokens = model.reconstruct(params, views, config=config)
     features = model.query_rays(params, tokens, views, config=config)
+    kept = features.dtype if config.fusion.feature_std is None else jnp.float16
     shown = model.show(params, features, views, config=config)
     guess = preview.latents(params, shown, config=config)
     clip = {
         "x0": jnp.concatenate(latents),
-        "features": fusion.standardised(features, config).astype(jnp.float16),
+        "features": fusion.standardised(features, config).astype(kept),
         "K": views["K"],
         "c2w": views["c2w"],
     }
