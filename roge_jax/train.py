@@ -228,9 +228,7 @@ def choose(args: argparse.Namespace, cfg):
     changes["remat"] = args.remat or estimate.default_remat(cfg)
     chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
     if args.encode_once:
-        store = functools.partial(stages_.once_encoded, config=cfg, samples=args.encode_once)
-        some = args.stage == "all"  # those of all that can
-        chosen = [s if some and not stages_.can_store(s, cfg) else store(s) for s in chosen]
+        chosen = stages_.all_once_encoded(chosen, cfg, args.encode_once)
     if args.lr:
         chosen = [
             dataclasses.replace(s, optim=dataclasses.replace(s.optim, learning_rate=args.lr))

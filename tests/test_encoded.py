@@ -138,6 +138,8 @@ def test_a_stage_that_trains_what_encodes_is_refused(stage, tmp_path, capsys):
     recipe += [stages.lora_stage(1, frames=config.frames, hires=hires) for hires in (False, True)]
     able = [s.name for s in recipe if stages.can_store(s, config)]
     assert able == ["generator", "hires"]
+    stored = stages.all_once_encoded(recipe, config, 4)
+    assert [s.name for s in stored if s.stored == 4] == able and len(stored) == len(recipe)
 
 
 def test_features_that_nobody_measured_keep_their_range():

@@ -227,6 +227,15 @@ def once_encoded(stage: Stage, config: RoGeConfig, samples: int) -> Stage:
     )
 
 
+def all_once_encoded(recipe: list[Stage], config: RoGeConfig, samples: int) -> list[Stage]:
+    """`once_encoded` for a stage by itself, and for those of a longer recipe that can."""
+    alone = len(recipe) == 1
+    return [
+        once_encoded(stage, config, samples) if alone or can_store(stage, config) else stage
+        for stage in recipe
+    ]
+
+
 def find_stage(stages: list[Stage], name: str) -> Stage:
     for stage in stages:
         if stage.name == name:
