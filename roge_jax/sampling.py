@@ -261,9 +261,10 @@ def sample(
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
     _check_photos(photos, config)
     if plan is not None:
-        if max(plan.choices.photos, default=0) >= given:
+        if tuple(plan.context) != tuple(photos.ids):
             raise UserError(
-                f"The plan takes photo {max(plan.choices.photos)} of {given}, from 0: plan again for these photos."
+                f"The plan was made for views {list(plan.context)} of the scene and the photos are views "
+                f"{list(photos.ids)}: give read_photos(scene, plan.context, config), or plan again for these photos."
             )
         photos, config, settings = reduced(photos, config, settings, plan.choices)
     context, target, info = normalise(

@@ -272,6 +272,19 @@ def test_photos_of_a_large_scene_are_chosen_by_what_the_path_sees(folder, photos
     assert len(coverage.see_path(scene, photos.cameras, 9, *size)) == 4
 
 
+def test_a_plan_of_a_scene_names_the_views_it_was_made_for(weights, folder, photos):
+    """Of four photos, one of which a model may see, the one that stands where the path goes."""
+    scene = load_scene(folder / "scene")
+    one = dataclasses.replace(CONFIG, max_context=1)
+    options = {"tolerance": 0.0, "settings": SETTINGS, "table": TABLE}
+    for view in (3, 1):
+        path = photos.cameras[[view] * CONFIG.frames]
+        plan = rj.plan(weights, one, scene, path, **options)
+        assert plan.context == (view,) and plan.choices.photos == (0,)
+        assert f"among views [{view}] of the scene" in plan.explain()
+    assert rj.plan(weights, CONFIG, scene, path, context=[2, 0], **options).context == (2, 0)
+
+
 def test_coverage_knows_no_unit_and_no_frame(photos, path):
     def moved(cameras):
         pose = np.eye(4)
@@ -345,7 +358,7 @@ def test_windows_that_are_not_generated_show_the_rgb_head(weights, photos, path)
 
 
 def run(weights, photos, path, choices, cache, **settings):
-    plan = types.SimpleNamespace(choices=choices)
+    plan = types.SimpleNamespace(choices=choices, context=photos.ids)
     settings = dataclasses.replace(SETTINGS, **settings)
     return sampling.sample(weights, CONFIG, photos, path, settings, plan=plan, cache=cache)
 
