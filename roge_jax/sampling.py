@@ -279,29 +279,24 @@ def sample(
     previews: list[np.ndarray] = []
     told: list[dict[str, Any]] = []
     evaluations = 0
-    for number, ((start, stop), (first, last)) in enumerate(zip(runs, made, strict=True)):
-        kept: list[int] = list(range(len(context)))
-        chosen: list[int] = []
-        images, recon, contexts = photos.images, photos.recon, context
-        if number and settings.long == "chain":
-            kept, chosen = chain_views(context, target[:start], target[start:stop], config)
-            found = [frames[i // config.frames][i % config.frames] for i in chosen]
-            old = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
-            images = np.concatenate([images[kept], old])
-            contexts = concatenate(context[kept], target[np.array(chosen, int)])
-            recon = None if recon is None else np.concatenate([recon[kept], _enlarged(old, recon)])
-        m, rest = len(contexts), around((start, stop), (first, last))
+    for number, (window, stretch) in enumerate(zip(runs, made, strict=True)):
+        (start, stop), (first, last) = window, stretch
+        later = number > 0 and settings.long == "chain"
+        seen = _Seen(photos.images, photos.recon, context, list(range(len(context))), [])
+        if later:
+            seen = _seen_later(seen, target, frames, window, config)
+        m, rest = len(seen.cameras), around(window, stretch)
         shown = [i for a, b in rest for i in range(a, b)]  # by the RGB head
         told.append(
             {
                 "frames": [start, stop - 1],
-                "photos": [photos.ids[i] for i in kept],
-                "generated": chosen,
+                "photos": [photos.ids[i] for i in seen.photos],
+                "generated": seen.made,
             }
         )
         if rest:
             told[-1]["rgb_head"] = [[a, b - 1] for a, b in rest]
-        see = functools.partial(window_views, images, recon, contexts, info=info, config=config)
+        see = functools.partial(window_views, *seen[:3], info=info, config=config)
         if first == last:
             part, views = config, [see(target[start:stop])]
         else:
@@ -324,7 +319,7 @@ def sample(
             continue
         bar.set_description("sampling")
         # With fewer photos than given, the targets keep the noise that they have with all of them.
-        full = sum(chained(given, config)) if number and settings.long == "chain" else given
+        full = sum(chained(given, config)) if later else given
         with stage("prepare"):
             ready = jax.block_until_ready(run.prepare(params, *views))
             prepared, picture = ready if shown else (ready, None)
@@ -352,6 +347,32 @@ def sample(
         tuple(told),
         warned,
     )
+
+
+class _Seen(NamedTuple):
+    """What a window sees: images, the same at reconstruction size or None, their cameras in the normalised frame, and
+    which photos and which frames already made they are."""
+
+    images: np.ndarray
+    recon: np.ndarray | None
+    cameras: Cameras
+    photos: list[int]
+    made: list[int]
+
+
+def _seen_later(
+    seen: _Seen, target: Cameras, frames: list[np.ndarray], window: tuple[int, int], config
+) -> _Seen:
+    """What a window after the first one sees, of the photos and of the `frames` of the windows before it."""
+    start, stop = window
+    kept, chosen = chain_views(seen.cameras, target[:start], target[start:stop], config)
+    images, recon = seen.images[kept], seen.recon
+    found = [frames[i // config.frames][i % config.frames] for i in chosen]
+    old = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
+    if recon is not None:
+        recon = np.concatenate([recon[kept], _enlarged(old, recon)])
+    cameras = concatenate(seen.cameras[kept], target[np.array(chosen, int)])
+    return _Seen(np.concatenate([images, old]), recon, cameras, kept, chosen)
 
 
 def integrate(

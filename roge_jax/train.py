@@ -10,9 +10,7 @@ config to load); lora and hires also adapter/ (what they changed, with a model c
 """
 
 import argparse
-import contextlib
 import dataclasses
-import functools
 import math
 from pathlib import Path
 
@@ -141,7 +139,7 @@ def main(args: argparse.Namespace) -> None:
     from .core.params import drawn
 
     distributed.maybe_initialise_distributed()
-    from .training import start
+    from .training import run, start
 
     preset, init = config.preset(args.preset), starting_point(args)
     start.check_processes(vars(args), init, args.data, version=__version__)
@@ -158,8 +156,13 @@ def main(args: argparse.Namespace) -> None:
             params = model.init(jax.random.key(args.seed), preset, make=drawn)
         else:
             params, _ = checkpoint.open_model(init)
+    given = [field.name for field in dataclasses.fields(run.Options) if field.name != "skip_done"]
+    options = run.Options(
+        **{name: getattr(args, name) for name in given}, skip_done=args.stage == "all"
+    )
     for stage in chosen:
-        params, cfg = run_stage(args, stage, params, stage_size(args, stage, cfg), mesh, init)
+        sized = stage_size(args, stage, cfg)
+        params, cfg = run.run_stage(stage, params, sized, options, mesh=mesh, base=init)
         init = str(args.out / stage.name / "model")
 
 
@@ -279,158 +282,6 @@ def stage_size(args: argparse.Namespace, stage, cfg):
 
     again = args.stage == "all" and stage.name == "hires"
     return resize(cfg, None, hires=True) if again else cfg
-
-
-def run_stage(args, stage, params, cfg, mesh, base: str):
-    """Train one stage on the model named `base` and save its model; returns (params, config) for the next.
-
-    The leaves of `params` may lie in files (`checkpoint.open_model`), as those do that are returned. Read are those that
-    train, into float32 on the host, and those that the objective reads, each straight to where it stays.
-    """
-    import jax
-
-    from . import checkpoint, model
-    from .core import distributed, sharding
-    from .core.lora import attach
-    from .core.params import count, flatten, loaded, unflatten
-    from .core.params import init as init_specs
-    from .cost import kept_as
-    from .training import loop, stages, start
-
-    out = args.out / stage.name
-    before = start.provenance(base)
-    opened, origin = params, start.fingerprint(params, base)
-    say = print if distributed.is_main() else (lambda *_: None)
-    dtype = start.kept_dtype(args.frozen_dtype)
-    done = args.resume and args.stage == "all" and (out / "model" / "config.json").exists()
-    told = []
-    if distributed.is_main():
-        begun = done or any(any((out / d).glob("*[0-9]*")) for d in ("checkpoints", "encoded"))
-        told = start.hold_settings(
-            out,
-            stage,
-            params,
-            cfg,
-            seed=args.seed,
-            frozen_dtype=dtype,
-            start=base,
-            pool=args.data,
-            begun=begun,
-            resume=args.resume,
-        )
-    if done:
-        say(f"{stage.name}: already trained, {out / 'model'}")
-        return checkpoint.open_model(out / "model")
-    for line in told:
-        say(line)
-    rows = distributed.local_rows(mesh, stage.batch)
-    working = stages.stage_config(cfg, stage)
-    size = working.height, working.width
-    source = start.open_data(args.data, stage, cfg)
-    if stage.about_preview and cfg.fusion.preview and cfg.fusion.preview_std is None:
-        params, cfg = stages.measure_preview(params, source, cfg, args.seed)
-        working = stages.stage_config(cfg, stage)
-    stage = dataclasses.replace(stage, views=dataclasses.replace(stage.views, size=size))
-    trainable, frozen = model.split(params, stage.trains)
-    specs, frozen_specs = stages.stage_specs(cfg, stage)
-    with start.on_host():
-        trainable = loaded(trainable)
-        if stage.lora:
-            added = stages.new_leaves(cfg, stage)
-            trainable = attach(trainable, init_specs(jax.random.key(args.seed + 1), added))
-    where = None if mesh is None else sharding.shardings(frozen_specs, mesh)
-    frozen = start.place_frozen(stages.read(frozen, stage), dtype, where)
-    if args.show_mesh:
-        shown = sharding.abstract_mesh() if mesh is None else mesh
-        kept = sharding.describe(frozen_specs, shown, kept_as(dtype))
-        say(f"trains: {sharding.describe(specs, shown)}\nfrozen: {kept}")
-    layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
-    say(
-        f"{stage.name}: {count(trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
-        f"{stage.batch} scenes at {working.height}x{working.width}, {layout} ({jax.devices()[0].device_kind})"
-    )
-    objective = functools.partial(stages.OBJECTIVES[stage.objective], config=working, stage=stage)
-    batches, encode = start.samples(
-        stage, source, params, working, args.seed, rows, out / "encoded", resume=args.resume
-    )
-    writer = None
-    if args.tensorboard and distributed.is_main():
-        from tensorboardX import SummaryWriter
-
-        writer = SummaryWriter(str(out / "tensorboard"))
-    evaluate = None
-    if args.evaluate_every:
-        evaluate = stages.held_out(objective, frozen, stage, working, encode=encode)
-    del encode  # and with it the networks that encode
-    diagnose = None
-    if args.diagnose_every and stage.objective == "joint":
-        from .training.diagnose import joint_diagnose
-
-        diagnose = joint_diagnose(working)
-    with contextlib.closing(writer) if writer else contextlib.nullcontext():
-        state = loop.train(
-            objective,
-            trainable,
-            frozen,
-            specs,
-            batches,
-            optim=stage.optim,
-            loop=loop.LoopConfig(
-                steps=stage.steps,
-                seed=args.seed,
-                log_every=args.log_every,
-                save_every=args.save_every,
-            ),
-            out=out,
-            resume=args.resume,
-            mesh=mesh,
-            frozen_specs=frozen_specs,
-            batch=stage.batch,
-            name=stage.name,
-            evaluate=evaluate,
-            evaluate_every=args.evaluate_every,
-            diagnose=diagnose,
-            diagnose_every=args.diagnose_every,
-            writer=writer,
-        )
-    learned = state.get("ema", state["params"])
-    learned = sharding.gather(learned)
-    lora = {path: x for path, x in flatten(learned).items() if path.endswith(("lora_a", "lora_b"))}
-    full = {path: x for path, x in flatten(learned).items() if path not in lora}
-    start.check_unchanged(opened, origin, base)
-    params = attach(params, unflatten(full))
-    if stages.moves_latents(full):
-        cfg = stages.measure_latents(params, source, cfg, args.seed)
-        cfg = dataclasses.replace(cfg, fusion=dataclasses.replace(cfg.fusion, preview_std=None))
-    if stage.objective == "recon" and not stage.lookup:
-        params, cfg = stages.measure_features(params, source, cfg, args.seed)
-    if stage.lookup and cfg.fusion.preview_std is not None:
-        cfg = stages.measure_spread(params, source, cfg, args.seed)
-    provenance = {
-        "stage": stage.name,
-        "steps": int(state["step"]),
-        "skipped": int(state["skipped"]),
-        "base": base,
-        "base_provenance": before,
-    }
-    if distributed.is_main():
-        with start.on_host():
-            checkpoint.save_model(
-                out / "model",
-                params,
-                cfg,
-                dtype=jax.numpy.float32,
-                provenance=provenance,
-                lora=unflatten(lora),
-            )
-        if stage.lora:
-            data = str(args.data or "procedural scenes")
-            provenance |= {"data": data, "base_weights": origin}
-            checkpoint.save_adapter(out / "adapter", learned, cfg, provenance)
-        change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
-        print(f"{stage.name}: saved {out / 'model'}{change}")
-    distributed.meet(f"{stage.name} is saved")
-    return checkpoint.open_model(out / "model")
 
 
 if __name__ == "__main__":

@@ -207,36 +207,10 @@ def train(
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     optimiser = make_optimiser(optim, specs, loop.steps)
-    if mesh is None:  # the step donates its state: the caller keeps these arrays
-        trainable = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), trainable)
-    state = initial_state(trainable, optimiser, optim)
-    where = None
-    if mesh is None:
-        # Where a restored state lies: one that lies nowhere would be another program to XLA.
-        state = jax.device_put(state, jax.local_devices()[0])
-    else:
-        everywhere = sharding.replicated(mesh)
-        where = sharding.state_shardings(state, specs, mesh), everywhere
-        state = sharding.place(state, where[0])
-        frozen = sharding.place(
-            frozen, everywhere if frozen_specs is None else sharding.shardings(frozen_specs, mesh)
-        )
+    state, frozen, where = _placed(trainable, frozen, optimiser, optim, specs, frozen_specs, mesh)
     checkpoints = Checkpoints(out / "checkpoints", keep=loop.keep)
     log_path = out / "log.jsonl"
-    latest = checkpoints.latest()
-    if latest is None:
-        if is_main():
-            log_path.unlink(missing_ok=True)
-    elif resume:
-        checkpoints.verify(latest)
-        _check_fits(checkpoints.folder, latest, state)
-        state = checkpoints.restore(state, latest)
-        if is_main():
-            _cut_log(log_path, int(state["step"]))
-    else:
-        raise UserError(
-            f"{out} holds a run at step {latest}: continue it with --resume, or choose another folder."
-        )
+    state = _continued(state, checkpoints, log_path, resume)
     step = jax.jit(make_step(objective, optimiser, optim), donate_argnums=0, out_shardings=where)
     key = jax.random.key(loop.seed)
     first, detector = int(state["step"]), DivergenceDetector(loop.patience)
@@ -310,6 +284,45 @@ def train(
             suspect = detector.beyond > 0 and done < loop.steps  # do not push good checkpoints out
             if due(loop.save_every) and not suspect:
                 checkpoints.save(done, state)
+    return state
+
+
+def _placed(trainable: Tree, frozen: Tree, optimiser, optim, specs, frozen_specs, mesh):
+    """(initial state, frozen weights, shardings of what a step returns or None), all where they stay.
+
+    The step donates its state: without a mesh the state has arrays of its own, and the caller keeps `trainable`.
+    """
+    if mesh is None:
+        trainable = jax.tree.map(lambda x: jax.device_put(x, may_alias=False), trainable)
+        state = initial_state(trainable, optimiser, optim)
+        # Where a restored state lies: one that lies nowhere would be another program to XLA.
+        return jax.device_put(state, jax.local_devices()[0]), frozen, None
+    state = initial_state(trainable, optimiser, optim)
+    everywhere = sharding.replicated(mesh)
+    where = sharding.state_shardings(state, specs, mesh), everywhere
+    kept = everywhere if frozen_specs is None else sharding.shardings(frozen_specs, mesh)
+    return sharding.place(state, where[0]), sharding.place(frozen, kept), where
+
+
+def _continued(state: Tree, checkpoints, log: Path, resume: bool) -> Tree:
+    """The state to go on from: that of the last checkpoint if there is one and `resume`, with the log cut to its step.
+
+    Raises: UserError if there is one and the run is to begin.
+    """
+    latest = checkpoints.latest()
+    if latest is None:
+        if is_main():
+            log.unlink(missing_ok=True)
+        return state
+    if not resume:
+        raise UserError(
+            f"{log.parent} holds a run at step {latest}: continue it with --resume, or choose another folder."
+        )
+    checkpoints.verify(latest)
+    _check_fits(checkpoints.folder, latest, state)
+    state = checkpoints.restore(state, latest)
+    if is_main():
+        _cut_log(log, int(state["step"]))
     return state
 
 
