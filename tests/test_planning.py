@@ -193,6 +193,41 @@ def test_every_purchase_lowers_the_error_and_the_best_rate_comes_first(make):
     assert rates == sorted(rates, reverse=True)
 
 
+def test_every_knob_enters_the_prediction_with_its_measured_error(photos, path):
+    """Alone each knob predicts its constant; with a proxy twice the typical one, twice that. Together squares add."""
+    path = path[: CONFIG.frames]
+    worth = coverage.coverage(photos.cameras, path, CONFIG.height, CONFIG.width)
+    full = full_choices(photos, CONFIG, path, SETTINGS)
+    small = proxies.half_size(CONFIG)
+    half = {"recon": (small.recon_height, small.recon_width)}
+    steps = {"solver": "unipc_2", "schedule": "shift", "steps": 3}
+    kept = coverage.selections(worth)[1]
+    lost = 1.0 - coverage.covered(worth, kept) / coverage.covered(worth, full.photos)
+    shown = {"generate": (None,), "frames": CONFIG.frames}
+    head = np.sqrt(np.square(TABLE.of_head(coverage.by_frame(photos.cameras, path, CONFIG.height, CONFIG.width))).mean())  # fmt: skip
+    alone = {  # what differs from the full model: its error, and the proxy that scales it
+        "merge": ({"merge": 2}, 0.01, "redundancy", 0.6),
+        "half": (half, 0.03, None, 0.0),
+        "steps": (steps, 0.04, "richardson", 0.2),
+        "photos": ({"photos": kept}, 0.12 * np.sqrt(lost), "leave_one_out", 0.2),
+        "head": (shown, head, "detail", 0.2),  # to the power of a half
+    }
+
+    def error(measured, **changes):
+        listed = list_options(photos, CONFIG, path, SETTINGS, TABLE, measured, worth)
+        wanted = dataclasses.replace(full, **changes)
+        (found,) = (o.error for o in listed if o.choices == wanted)
+        return found
+
+    for name, (changes, expected, proxy, double) in alone.items():
+        assert error({}, **changes) == pytest.approx(expected, rel=1e-6), name
+        if proxy is not None:
+            assert error({proxy: double}, **changes) == pytest.approx(2 * expected, rel=1e-6), name
+    together = error({}, merge=2, **half, **steps, photos=kept)
+    four = (alone[name][1] for name in ("merge", "half", "steps", "photos"))
+    assert together == pytest.approx(np.sqrt(sum(e**2 for e in four)), rel=1e-6)
+
+
 def test_explain_tells_what_was_bought_and_what_was_not(make):
     plan = make(0.05)
     text = plan.explain()
