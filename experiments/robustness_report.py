@@ -239,7 +239,8 @@ def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> Non
             if times > 1:
                 levels, mean, *_ = joined(found, (name,), "rgb_head", metric)
                 ax.plot(levels, mean, ":", color=COLOURS["rgb_head"], lw=1)
-                ax.annotate(f"x{times}", (levels[0], mean[0]), fontsize=8, ha="right")
+                end, shift = (levels[0], mean[0]), (14, {2: -11, 4: -3, 8: 5}[times])
+                ax.annotate(f"x{times}", end, shift, textcoords="offset points", fontsize=8)
         for knob_name in knobs:
             for method in MODELS if metric == "psnr" else ():
                 at = broken[knob_name][method]["loses_1_db"]["at"]
