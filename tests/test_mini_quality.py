@@ -241,7 +241,7 @@ def report_of(records):
 
 
 def test_samplers_are_drawn_against_evaluations_and_seconds(monkeypatch):
-    """Error and PSNR against both, consistency against evaluations, for every solver; slowest and fastest runs as bars."""
+    """Error, PSNR and consistency against both, for every solver; slowest and fastest runs as bars."""
     records = [point(s, n, 0.5 / n, 0.8 / n, 0.5) for s in ("euler", "ab2") for n in (4, 8)]
     drawn = []
     monkeypatch.setattr(charts, "save", lambda figure, path: drawn.append(figure))
@@ -254,6 +254,7 @@ def test_samplers_are_drawn_against_evaluations_and_seconds(monkeypatch):
         ("evaluations", "psnr_to_euler50"): (lambda r: r["psnr_to_euler50"]["mean"]),
         ("seconds", "psnr_to_euler50"): (lambda r: r["psnr_to_euler50"]["mean"]),
         ("evaluations", "consistency"): (lambda r: r["metrics"]["consistency"]["mean"]),
+        ("seconds", "consistency"): (lambda r: r["metrics"]["consistency"]["mean"]),
     }
     panels = {(x, metric): ax for ax, (x, metric, _) in zip(column, charts.ROWS, strict=True)}
     for (x, metric), measure in wanted.items():
