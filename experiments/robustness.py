@@ -21,7 +21,6 @@ is measured without the network (`robustness_matching`). `--only` measures some 
 
 import argparse
 import functools
-import hashlib
 import json
 import time
 import warnings
@@ -331,12 +330,6 @@ def measure(
 # ---- the program ---------------------------------------------------------------------------------
 
 
-def fingerprint(name: str) -> str:
-    """The first 12 digits of the SHA-256 of a model's weight files."""
-    files = sorted(checkpoint.find_model(name).glob("model-*.safetensors"))
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()[:12]
-
-
 def rounded(value: Any) -> Any:
     """Five digits are more than the noise."""
     return json.loads(json.dumps(value), parse_float=lambda text: float(f"{float(text):.5g}"))
@@ -369,7 +362,7 @@ def main() -> None:
         runner = Runner(args.checkpoint)
         settings = {
             "checkpoint": args.checkpoint,
-            "weights": fingerprint(args.checkpoint),
+            "weights": checkpoint.weights_fingerprint(runner.params, "float32"),
             "model": runner.config.name,
             "size": [runner.config.height, runner.config.width],
             "seeds": seeds,
