@@ -35,6 +35,11 @@ class Planned(Protocol):
     @property
     def choices(self) -> Choices: ...
 
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """The views of the scene, in the order of the photos, that it was made for."""
+        ...
+
 
 def spans(plan: Planned | None, windows: list[Span], length: int) -> tuple[list[Span], int]:
     """(the frames that are generated in each window of `length`, of none an empty span at its start; how many together).

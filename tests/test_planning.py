@@ -1,6 +1,7 @@
 """The planner on the tiny model: monotone, deterministic, within budget, and at tolerance 0 the full model itself."""
 
 import dataclasses
+import functools
 import itertools
 import types
 from pathlib import Path
@@ -13,7 +14,7 @@ from scene_files import nerfstudio, truth
 import roge_jax as rj
 from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.config import preset
-from roge_jax.data.scene import load_scene
+from roge_jax.data.scene import load_scene, select_context
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import make_path
@@ -307,6 +308,27 @@ def test_photos_of_a_large_scene_are_chosen_by_what_the_path_sees(folder, photos
     assert len(coverage.see_path(scene, photos.cameras, 9, *size)) == 4
 
 
+def test_a_scene_is_planned_with_the_photos_that_see_the_path(weights, folder, photos):
+    """Two of four: those whose views the path repeats, not those that lie farthest apart. A run with others is refused."""
+    scene, config = load_scene(folder / "scene"), dataclasses.replace(CONFIG, max_context=2)
+    path = photos.cameras[[2, 3, 3, 2, 2]]
+    assert set(select_context(scene, 2)) != {2, 3}
+    plan = rj.plan(weights, config, scene, path, tolerance=0.0, settings=SETTINGS, table=TABLE)
+    assert set(plan.ids) == {2, 3} and plan.choices.photos == (0, 1)
+    own = sampling.read_photos(scene, plan.ids, config)
+    settings = dataclasses.replace(SETTINGS, steps=2)
+    plan = rj.plan(weights, config, own, path, tolerance=0.0, settings=settings, table=TABLE)
+    run = functools.partial(sampling.sample, weights, config, path=path, settings=settings)
+    assert run(own, plan=plan).windows[0]["photos"] == list(plan.ids)
+    other = sampling.read_photos(scene, [0, 1], config)
+    with pytest.raises(
+        UserError, match=r"for the photos \[\d, \d\] of the scene, these are \[0, 1\]"
+    ):
+        run(other, plan=plan)
+    chosen = rj.plan(weights, config, scene, path, tolerance=0.0, context=[1, 0], table=TABLE)
+    assert chosen.ids == (1, 0)
+
+
 def test_coverage_knows_no_unit_and_no_frame(photos, path):
     def moved(cameras):
         pose = np.eye(4)
@@ -380,7 +402,7 @@ def test_windows_that_are_not_generated_show_the_rgb_head(weights, photos, path)
 
 
 def run(weights, photos, path, choices, cache, **settings):
-    plan = types.SimpleNamespace(choices=choices)
+    plan = types.SimpleNamespace(choices=choices, ids=photos.ids)
     settings = dataclasses.replace(SETTINGS, **settings)
     return sampling.sample(weights, CONFIG, photos, path, settings, plan=plan, cache=cache)
 

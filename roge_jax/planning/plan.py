@@ -20,7 +20,7 @@ from .. import cost
 from ..choices import Choices
 from ..config import RoGeConfig
 from ..core.params import Tree
-from ..data.scene import Scene, select_context
+from ..data.scene import Scene
 from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling import Photos, Settings, read_photos
@@ -51,6 +51,7 @@ class Plan:
     """
 
     choices: Choices
+    ids: tuple[int, ...]  # views of the scene, all that the full model sees
     frames: int  # of the path
     tolerance: float
     max_cost: float | None
@@ -103,7 +104,8 @@ def plan(
 
     Args:
       scene: `Photos`, all of which the full model sees, or a scene: its views `context`, by default as many as the
-        model takes, chosen by `select_context`. The plan's photos are positions among them.
+        model takes and those that see most of the path (`coverage.see_path`). The plan's `ids` are these views and its
+        photos positions among them: `read_photos(scene, plan.ids, config)` makes what `sample` takes.
       path: the cameras to be rendered, as for `sample`.
       tolerance: RMS difference to the full model's frames, colours from 0 to 1; 0 is the full model, bit for bit.
       max_cost: FLOPs of planning and run together; beyond it the tolerance is given up, which `notes` says.
@@ -115,7 +117,7 @@ def plan(
     """
     _check(tolerance, max_cost)
     settings = (Settings() if settings is None else settings).of(config)
-    photos = scene if isinstance(scene, Photos) else photos_of(scene, config, context)
+    photos = scene if isinstance(scene, Photos) else photos_of(scene, config, context, path)
     full = full_choices(photos, config, path, settings)
     table = load(config.name) if table is None else table
     measured, worth = proxies.Measured({}, 0.0), None
@@ -150,6 +152,7 @@ def plan(
         )
     return Plan(
         choices=chosen.choices,
+        ids=tuple(photos.ids),
         frames=len(path),
         tolerance=float(tolerance),
         max_cost=None if max_cost is None else float(max_cost),
@@ -173,11 +176,14 @@ def _check(tolerance: float, max_cost: float | None) -> None:
         raise UserError(f"max_cost {max_cost}: give a positive number of FLOPs, e.g. 5e10.")
 
 
-def photos_of(scene: Scene, config: RoGeConfig, context: Sequence[int] | None) -> Photos:
-    """The photos of the full model."""
+def photos_of(
+    scene: Scene, config: RoGeConfig, context: Sequence[int] | None, path: Cameras
+) -> Photos:
+    """The photos of the full model: the views `context`, or those that see most of the path, best first."""
     if context is None:
-        context = select_context(scene, min(len(scene), config.max_context))
-    return read_photos(scene, list(context), config)
+        most = min(len(scene), config.max_context)
+        context = coverage.see_path(scene, path, most, config.height, config.width)
+    return read_photos(scene, context, config)
 
 
 def _named(c: Choices) -> str:
