@@ -449,6 +449,26 @@ def test_leave_one_out_finds_what_a_perfect_head_would_not_miss(
     assert proxies.leave_one_out(weights, CONFIG, photos, known)["leave_one_out"] < 1e-6
 
 
+def test_richardson_is_the_distance_of_two_steps_from_four(photos, path, monkeypatch):
+    """A sampler whose every number is the count of its evaluations; and it is measured where it may cost that much."""
+    seen = []
+
+    def generate(params, prepared, noise, *, config, solver, mode):
+        seen.append((len(solver.sigma), config.recon_height, mode))
+        return jax.numpy.full_like(noise, len(solver.sigma)), None
+
+    monkeypatch.setattr(proxies.model, "prepare", lambda params, views, config: views)
+    monkeypatch.setattr(proxies.model, "generate", generate)
+    assert proxies.richardson({}, CONFIG, photos, path, SETTINGS, {}) == pytest.approx(2.0)
+    assert seen == [(2, CONFIG.recon_height // 2, SETTINGS.slots), (4, *seen[0][1:])]
+    price = proxies.richardson_price(CONFIG, 4)
+    for most, measured in ((0.999 * price, False), (1.001 * price, True)):
+        monkeypatch.setattr(proxies, "leave_one_out_price", lambda config, m: np.inf)
+        found = proxies.measure({}, CONFIG, photos, path, SETTINGS, most, {})
+        assert ("richardson" in found.values) == measured
+        assert found.flops == (price if measured else 0.0)
+
+
 def test_what_costs_more_than_its_share_is_not_measured(make):
     price = proxies.leave_one_out_price(CONFIG, 4)
     full = make(0.0).full_cost
