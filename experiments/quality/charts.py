@@ -217,7 +217,7 @@ def knobs(report: Report, path: Path) -> None:
     sizes = [r for r in records if r["knob"] == "resolution"]
     for r in sizes:
         sharpness = r["metrics"]["sharpness_ratio"]["mean"]
-        point(ax, r, "psnr", "#d62728", text=f"{r['value']}\nsharpness {sharpness:.2f}")
+        point(ax, r, "psnr", "#d62728", text=f"{r['value']}\nsharpness {sharpness:.2f}", below=True)
     ax.set(ylabel="PSNR at the training size, dB", title="size of photos and frames, default sampler")  # fmt: skip
     plain_seconds(ax, spread_of(sizes, 2))
 
@@ -241,7 +241,7 @@ def knobs(report: Report, path: Path) -> None:
     at = [work(r, "seconds") for r in full]
     ax.plot(at, [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, other step counts")  # fmt: skip
     ax.set(yscale="log", ylabel="relative L2 error of the latents", title="block cache (squares) against exact (dots)")  # fmt: skip
-    plain_seconds(ax, spread_of([*full, *cached], 6))
+    plain_seconds(ax, spread_of([*full, *cached], 25))
     ax.legend(fontsize=8)
 
     ax = axes[1, 3]
