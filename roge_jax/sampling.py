@@ -267,6 +267,10 @@ def sample(
                 f"The plan is for the photos {list(plan.ids)} of the scene, these are {list(photos.ids)}: read_photos(scene, "
                 "plan.ids, config), or plan again for these photos."
             )
+        if max(plan.choices.photos, default=0) >= given:
+            raise UserError(
+                f"The plan takes photo {max(plan.choices.photos)} of {given}, from 0: plan again for these photos."
+            )
         photos, config, settings = reduced(photos, config, settings, plan.choices)
     context, target, info = normalise(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale

@@ -719,9 +719,8 @@ def test_wrong_arguments_from_python_are_named(weights, photos):
     ):
         choices = sampling.Choices(kept, 2, "euler", "uniform", size, 1, generate, WINDOW)
         with pytest.raises(UserError, match=said):
-            sampling.sample(
-                weights, CONFIG, photos, path, SETTINGS, plan=type("P", (), {"choices": choices})
-            )
+            plan = type("P", (), {"choices": choices, "ids": photos.ids})
+            sampling.sample(weights, CONFIG, photos, path, SETTINGS, plan=plan)
 
 
 NAN_POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, float("nan")], [0, 0, 0, 1]]
