@@ -66,7 +66,7 @@ def jobs(args: argparse.Namespace) -> dict[str, Job]:
     source = read_pool(args.data) if args.data else ProceduralSource(64, 112, 24)
     mini, (params, config) = preset("mini"), checkpoint.load_model("mini")
     plain = dataclasses.replace(mini, renderer=dataclasses.replace(mini.renderer, lookup=0))
-    weights = {"weights": fingerprint(params), "clips": args.clips}
+    weights = {"weights": checkpoint.weights_fingerprint(params, "float32"), "clips": args.clips}
     found = {
         name: Job(
             "reconstruction",

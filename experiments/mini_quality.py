@@ -34,13 +34,12 @@ from quality.scenes import (
     DEFAULT_M,
     Sampler,
     assemble,
-    fingerprint,
     most_steps,
     render,
     timed,
 )
 
-from roge_jax.checkpoint import load_model
+from roge_jax.checkpoint import load_model, weights_fingerprint
 from roge_jax.config import FlowConfig, RoGeConfig
 from roge_jax.data.procedural import HELDOUT_SEED
 from roge_jax.entry import enable_cache
@@ -186,7 +185,7 @@ def main(args: argparse.Namespace) -> None:
     others.append(knobs.round_trip(params, config, scenes, judge))
 
     found = table_of_schedules(config.name)
-    weights = fingerprint(params)
+    weights = weights_fingerprint(params, "float32")
     git = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
         capture_output=True,

@@ -22,9 +22,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from quality.scenes import DEFAULT_M, Sampler, assemble, fingerprint, most_steps, render
+from quality.scenes import DEFAULT_M, Sampler, assemble, most_steps, render
 
-from roge_jax.checkpoint import load_model
+from roge_jax.checkpoint import load_model, weights_fingerprint
 from roge_jax.entry import enable_cache
 from roge_jax.video import flow, solvers
 
@@ -110,7 +110,7 @@ def main(args: argparse.Namespace) -> None:
     found = {
         "command": f"python experiments/optimise_schedules.py --checkpoint {args.checkpoint} "
         f"--solvers {' '.join(args.solvers)} --scenes {args.scenes}",
-        "weights": fingerprint(params),
+        "weights": weights_fingerprint(params, "float32"),
         "search_seeds": list(range(SEARCH, SEARCH + args.scenes)),
         "check_seeds": list(range(CHECK, CHECK + args.scenes)),
         "photos": DEFAULT_M,

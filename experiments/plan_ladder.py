@@ -51,7 +51,7 @@ TRAIN_SEED = 500_000  # training seeds that no shipped pool used
 TOLERANCES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.08)
 
 
-def provenance(command: str, scenes: int) -> dict:
+def provenance(command: str, scenes: int, params) -> dict:
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"],
         capture_output=True,
@@ -59,14 +59,11 @@ def provenance(command: str, scenes: int) -> dict:
         cwd=Path(__file__).parent,
         check=False,
     )
-    found = checkpoint.find_model("mini")
     return {
         "command": command,
         "scenes": scenes,
         "commit": commit.stdout.strip(),
-        "weights": sorted(
-            f"{f.name} {f.stat().st_size}" for f in Path(found).glob("*.safetensors")
-        ),
+        "weights": checkpoint.weights_fingerprint(params, "float32"),
         "device": f"{jax.default_backend()}, jax {jax.__version__}",
         "date": time.strftime("%Y-%m-%d"),
     }
@@ -79,7 +76,9 @@ def calibrate(engine: Engine, scenes: int) -> None:
         rows.append(turn_knobs(engine, make(RUNGS[i % len(RUNGS)], TRAIN_SEED + i, engine.config)))
         row = {k: v for k, v in rows[-1].items() if k not in ("photos", "steps")}
         print(f"{time.process_time() - began:.0f} s {json.dumps(row)}", flush=True)
-    origin = provenance(f"python experiments/plan_ladder.py --calibrate {scenes}", scenes)
+    origin = provenance(
+        f"python experiments/plan_ladder.py --calibrate {scenes}", scenes, engine.params
+    )
     origin |= {
         "seeds": [TRAIN_SEED, TRAIN_SEED + scenes - 1],
         "model": "the shipped mini",
@@ -290,7 +289,7 @@ def main() -> None:
         ]
         document = climb(engine, scenes)
         command = f"python experiments/plan_ladder.py {args.scenes}"
-        document["provenance"] = provenance(command, len(document["rows"]))
+        document["provenance"] = provenance(command, len(document["rows"]), engine.params)
         document["provenance"]["table"] = table.load("mini").provenance
     else:
         document = json.loads(OUT.read_text())

@@ -21,7 +21,6 @@ is measured without the network (`robustness_matching`). `--only` measures some 
 
 import argparse
 import functools
-import hashlib
 import json
 import time
 import warnings
@@ -331,12 +330,6 @@ def measure(
 # ---- the program ---------------------------------------------------------------------------------
 
 
-def fingerprint(name: str) -> str:
-    """The first 12 digits of the SHA-256 of a model's weight files."""
-    files = sorted(checkpoint.find_model(name).glob("model-*.safetensors"))
-    return hashlib.sha256(b"".join(f.read_bytes() for f in files)).hexdigest()[:12]
-
-
 def rounded(value: Any) -> Any:
     """Five digits are more than the noise."""
     return json.loads(json.dumps(value), parse_float=lambda text: float(f"{float(text):.5g}"))
@@ -357,8 +350,10 @@ def main() -> None:
     names = [*KNOBS, "matching"] if args.only is None else args.only.split(",")
     if unknown := set(names) - {*KNOBS, "matching"}:
         p.error(f"--only {args.only}: there is no {', '.join(sorted(unknown))}")
-    names = [] if args.draw else names
     stored = json.loads(file.read_text()) if args.draw or args.only else {}
+    if args.draw:
+        show(stored)
+        return
     entry.enable_cache()
     began = time.perf_counter()
     document, found = stored, numbers(stored.get("knobs", {}))
@@ -367,7 +362,7 @@ def main() -> None:
         runner = Runner(args.checkpoint)
         settings = {
             "checkpoint": args.checkpoint,
-            "weights": fingerprint(args.checkpoint),
+            "weights": checkpoint.weights_fingerprint(runner.params, "float32"),
             "model": runner.config.name,
             "size": [runner.config.height, runner.config.width],
             "seeds": seeds,
@@ -390,9 +385,9 @@ def main() -> None:
             lambda seed: Place(seed, *size), spread(3), document["breaks"], args.workers
         )
     made = entry.environment() | {"seconds": round(time.perf_counter() - began, 1)}
-    if stored and names:
+    if stored:
         document["again"] = document.get("again", {}) | {name: made for name in names}
-    elif names:
+    else:
         document |= made
     document["knobs"] = json.loads(json.dumps(found).replace("NaN", "null"))
     document["limits"] = limit_rows(found, document["breaks"], document["undisturbed"])
@@ -402,6 +397,15 @@ def main() -> None:
     document = rounded(document)
     OUT.mkdir(exist_ok=True)
     file.write_text(json.dumps(document, separators=(",", ":")) + "\n")
+    show(document)
+    if args.limits:
+        write_limits(document)
+        print(f"wrote {limits.TABLE}")
+
+
+def show(document: dict) -> None:
+    """Pictures and tables of a stored document; nothing is computed again, so that they agree with `limits.json`."""
+    found = numbers(document["knobs"])
     for metric, suffix in (("psnr", ""), ("ssim", "_ssim"), ("sharpness_ratio", "_sharpness")):
         count = len(document["settings"]["seeds"])
         draw(found, document["breaks"], metric, count, OUT / f"robustness{suffix}.png")
@@ -410,9 +414,6 @@ def main() -> None:
         text += "\n\n" + robustness_matching.table(document["matching"], document["limits"])
     (OUT / "robustness.md").write_text(text + "\n")
     print(text)
-    if args.limits:
-        write_limits(document)
-        print(f"wrote {limits.TABLE}")
 
 
 def numbers(found: dict) -> dict:

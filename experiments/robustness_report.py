@@ -29,23 +29,23 @@ class Knob(NamedTuple):
 
 
 KNOBS = {
-    "rotation": Knob("pose: rotation", "RMS error of the photos, degrees", (1, 2, 4, 8, 16)),
-    "position": Knob("pose: position", "RMS error, fraction of the baseline", (0.05, 0.1, 0.2, 0.4, 0.8)),
-    "focal": Knob("focal length", "error of the photos, %, either sign", (5, 10, 20, 40)),
-    "noise": Knob("photo noise", "standard deviation (white = 1)", (0.05, 0.1, 0.2, 0.3)),
-    "blur": Knob("photo blur", "Gaussian sigma, pixels of 112", (0.5, 1, 2, 4)),
+    "rotation": Knob("pose: rotation", "RMS error of the photos, degrees", (0.25, 0.5, 1, 2, 4, 8, 16)),
+    "position": Knob("pose: position", "RMS error, fraction of the baseline", (0.0125, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8)),
+    "focal": Knob("focal length", "error of the photos, %, either sign", (0.5, 1, 2, 5, 10, 20, 40)),
+    "noise": Knob("photo noise", "standard deviation (white = 1)", (0.0125, 0.025, 0.05, 0.1, 0.2, 0.3)),
+    "blur": Knob("photo blur", "Gaussian sigma, pixels of 112", (0.25, 0.5, 1, 2, 4)),
     "jpeg": Knob("JPEG", "quality", (90, 75, 50, 20, 10, 5), 100, True),
     "jpeg2": Knob("JPEG, photo twice the size", "quality", (75, 50, 20, 5), 100, True),
     "jpeg4": Knob("JPEG, photo 4 times the size", "quality", (50, 20, 5), 100, True),
     "jpeg8": Knob("JPEG, photo 8 times the size", "quality", (20, 5), 100, True),
-    "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.5, 1, 1.5, 2)),
+    "exposure": Knob("exposure mismatch", "darkest to lightest photo, stops", (0.125, 0.25, 0.5, 1, 1.5, 2)),
     "photos": Knob("fewer photos", "photos, all distinct", (2, 1), 3),
     "more": Knob("more photos", "photos, all distinct", (4, 6), 3),
     "copies": Knob("repeated photos", "distinct photos of 3", (2, 1), 3),
     "padding": Knob("repeated photos", "photos, of which 3 distinct", (6,), 3),
     "crowding": Knob("crowded photos", "spacing of the photos, 1 = even", (0.6, 0.4, 0.2), 1.0),
     "extrapolation": Knob("extrapolation", "targets outside the photos' hull, baselines", REACHES),
-    "wider": Knob("wider targets", "field of view over the photos' (tangents)", (1.05, 1.1, 1.2, 1.5, 2), 1.0, True),
+    "wider": Knob("wider targets", "field of view over the photos' (tangents)", (1.025, 1.05, 1.1, 1.2, 1.5, 2), 1.0, True),
     "narrower": Knob("narrower targets", "field of view over the photos'", (0.95, 0.9, 0.8, 0.6, 0.4), 1.0, True),
 }  # fmt: skip
 
@@ -239,7 +239,8 @@ def draw(found: dict, broken: dict, metric: str, scenes: int, path: Path) -> Non
             if times > 1:
                 levels, mean, *_ = joined(found, (name,), "rgb_head", metric)
                 ax.plot(levels, mean, ":", color=COLOURS["rgb_head"], lw=1)
-                ax.annotate(f"x{times}", (levels[0], mean[0]), fontsize=8, ha="right")
+                end, shift = (levels[0], mean[0]), (14, {2: -11, 4: -3, 8: 5}[times])
+                ax.annotate(f"x{times}", end, shift, textcoords="offset points", fontsize=8)
         for knob_name in knobs:
             for method in MODELS if metric == "psnr" else ():
                 at = broken[knob_name][method]["loses_1_db"]["at"]

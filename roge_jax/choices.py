@@ -36,7 +36,9 @@ class Planned(Protocol):
     def choices(self) -> Choices: ...
 
     @property
-    def context(self) -> tuple[int, ...]: ...  # views of the scene that it was made for
+    def ids(self) -> tuple[int, ...]:
+        """The views of the scene, in the order of the photos, that it was made for."""
+        ...
 
 
 def spans(plan: Planned | None, windows: list[Span], length: int) -> tuple[list[Span], int]:

@@ -14,7 +14,7 @@ one length, to the RGB head: for both kinds of window that is one compilation mo
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple
 
@@ -153,8 +153,9 @@ def _view(word: str, scene: Scene) -> int:
     )
 
 
-def read_photos(scene: Scene, ids: list[int], config: RoGeConfig) -> Photos:
+def read_photos(scene: Scene, ids: Sequence[int], config: RoGeConfig) -> Photos:
     """The photos `ids` of a scene, the first one being the world frame. Duplicates are dropped with a warning."""
+    ids = list(ids)
     images, cameras = prepare_photos(scene, ids, config.height, config.width, drop_duplicates=False)
     kept = distinct_views(images, cameras)
     if len(kept) < len(ids):
@@ -261,10 +262,14 @@ def sample(
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
     _check_photos(photos, config)
     if plan is not None:
-        if tuple(plan.context) != tuple(photos.ids):
+        if tuple(plan.ids) != tuple(photos.ids):
             raise UserError(
-                f"The plan was made for views {list(plan.context)} of the scene and the photos are views "
-                f"{list(photos.ids)}: give read_photos(scene, plan.context, config), or plan again for these photos."
+                f"The plan was made for views {list(plan.ids)} of the scene and the photos are views {list(photos.ids)}: "
+                "give read_photos(scene, plan.ids, config), or plan again for these photos."
+            )
+        if max(plan.choices.photos, default=0) >= given:
+            raise UserError(
+                f"The plan takes photo {max(plan.choices.photos)} of {given}, from 0: plan again for these photos."
             )
         photos, config, settings = reduced(photos, config, settings, plan.choices)
     context, target, info = normalise(

@@ -17,9 +17,10 @@ import work_precision
 from mini_quality import verdict
 from quality import charts, knobs, scenes
 from quality.measures import GAP, consistency, same_surface
-from quality.scenes import CONTEXTS, REPEATS, Sampler, Scenes, fingerprint, most_steps, photos
+from quality.scenes import CONTEXTS, REPEATS, Sampler, Scenes, most_steps, photos
 
 from roge_jax import model
+from roge_jax.checkpoint import weights_fingerprint
 from roge_jax.config import FlowConfig, preset
 from roge_jax.core.params import flatten, unflatten
 from roge_jax.video.solvers import nfe
@@ -219,15 +220,15 @@ def test_grids_of_one_length_are_timed_once_and_sampled_each():
 def test_the_fingerprint_covers_every_leaf_of_every_part():
     flat = flatten(model.init(jax.random.key(0), preset("tiny")))
     assert {path.split("/")[0] for path in flat} >= {"dit", "fusion", "renderer", "encoder", "vae"}
-    whole = fingerprint(unflatten(flat))
-    assert whole == fingerprint(unflatten(flat)) and len(whole) == 12
+    whole = weights_fingerprint(unflatten(flat), "float32")
+    assert whole == weights_fingerprint(unflatten(flat), "float32") and len(whole) == 12
     last = {path.split("/")[0]: path for path in flat}  # of each part
     for path in last.values():
         changed = flat | {path: flat[path].at[(-1,) * flat[path].ndim].add(1e-3)}
-        assert fingerprint(unflatten(changed)) != whole, path
+        assert weights_fingerprint(unflatten(changed), "float32") != whole, path
     named = flat | {"dit/other": flat[last["dit"]]}
     named.pop(last["dit"])
-    assert fingerprint(unflatten(named)) != whole
+    assert weights_fingerprint(unflatten(named), "float32") != whole
 
 
 def report_of(records):
@@ -241,7 +242,7 @@ def report_of(records):
 
 
 def test_samplers_are_drawn_against_evaluations_and_seconds(monkeypatch):
-    """Error and PSNR against both, consistency against evaluations, for every solver; slowest and fastest runs as bars."""
+    """Error, PSNR and consistency against both, for every solver; slowest and fastest runs as bars."""
     records = [point(s, n, 0.5 / n, 0.8 / n, 0.5) for s in ("euler", "ab2") for n in (4, 8)]
     drawn = []
     monkeypatch.setattr(charts, "save", lambda figure, path: drawn.append(figure))
@@ -254,6 +255,7 @@ def test_samplers_are_drawn_against_evaluations_and_seconds(monkeypatch):
         ("evaluations", "psnr_to_euler50"): (lambda r: r["psnr_to_euler50"]["mean"]),
         ("seconds", "psnr_to_euler50"): (lambda r: r["psnr_to_euler50"]["mean"]),
         ("evaluations", "consistency"): (lambda r: r["metrics"]["consistency"]["mean"]),
+        ("seconds", "consistency"): (lambda r: r["metrics"]["consistency"]["mean"]),
     }
     panels = {(x, metric): ax for ax, (x, metric, _) in zip(column, charts.ROWS, strict=True)}
     for (x, metric), measure in wanted.items():

@@ -1,6 +1,7 @@
 """The planner on the tiny model: monotone, deterministic, within budget, and at tolerance 0 the full model itself."""
 
 import dataclasses
+import functools
 import itertools
 import types
 from pathlib import Path
@@ -13,7 +14,7 @@ from scene_files import nerfstudio, truth
 import roge_jax as rj
 from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.config import preset
-from roge_jax.data.scene import load_scene
+from roge_jax.data.scene import load_scene, select_context
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import make_path
@@ -193,6 +194,41 @@ def test_every_purchase_lowers_the_error_and_the_best_rate_comes_first(make):
     assert rates == sorted(rates, reverse=True)
 
 
+def test_every_knob_enters_the_prediction_with_its_measured_error(photos, path):
+    """Alone each knob predicts its constant; with a proxy twice the typical one, twice that. Together squares add."""
+    path = path[: CONFIG.frames]
+    worth = coverage.coverage(photos.cameras, path, CONFIG.height, CONFIG.width)
+    full = full_choices(photos, CONFIG, path, SETTINGS)
+    small = proxies.half_size(CONFIG)
+    half = {"recon": (small.recon_height, small.recon_width)}
+    steps = {"solver": "unipc_2", "schedule": "shift", "steps": 3}
+    kept = coverage.selections(worth)[1]
+    lost = 1.0 - coverage.covered(worth, kept) / coverage.covered(worth, full.photos)
+    shown = {"generate": (None,), "frames": CONFIG.frames}
+    head = np.sqrt(np.square(TABLE.of_head(coverage.by_frame(photos.cameras, path, CONFIG.height, CONFIG.width))).mean())  # fmt: skip
+    alone = {  # what differs from the full model: its error, and the proxy that scales it
+        "merge": ({"merge": 2}, 0.01, "redundancy", 0.6),
+        "half": (half, 0.03, None, 0.0),
+        "steps": (steps, 0.04, "richardson", 0.2),
+        "photos": ({"photos": kept}, 0.12 * np.sqrt(lost), "leave_one_out", 0.2),
+        "head": (shown, head, "detail", 0.2),  # to the power of a half
+    }
+
+    def error(measured, **changes):
+        listed = list_options(photos, CONFIG, path, SETTINGS, TABLE, measured, worth)
+        wanted = dataclasses.replace(full, **changes)
+        (found,) = (o.error for o in listed if o.choices == wanted)
+        return found
+
+    for name, (changes, expected, proxy, double) in alone.items():
+        assert error({}, **changes) == pytest.approx(expected, rel=1e-6), name
+        if proxy is not None:
+            assert error({proxy: double}, **changes) == pytest.approx(2 * expected, rel=1e-6), name
+    together = error({}, merge=2, **half, **steps, photos=kept)
+    four = (alone[name][1] for name in ("merge", "half", "steps", "photos"))
+    assert together == pytest.approx(np.sqrt(sum(e**2 for e in four)), rel=1e-6)
+
+
 def test_explain_tells_what_was_bought_and_what_was_not(make):
     plan = make(0.05)
     text = plan.explain()
@@ -272,17 +308,26 @@ def test_photos_of_a_large_scene_are_chosen_by_what_the_path_sees(folder, photos
     assert len(coverage.see_path(scene, photos.cameras, 9, *size)) == 4
 
 
-def test_a_plan_of_a_scene_names_the_views_it_was_made_for(weights, folder, photos):
-    """Of four photos, one of which a model may see, the one that stands where the path goes."""
-    scene = load_scene(folder / "scene")
-    one = dataclasses.replace(CONFIG, max_context=1)
-    options = {"tolerance": 0.0, "settings": SETTINGS, "table": TABLE}
-    for view in (3, 1):
-        path = photos.cameras[[view] * CONFIG.frames]
-        plan = rj.plan(weights, one, scene, path, **options)
-        assert plan.context == (view,) and plan.choices.photos == (0,)
-        assert f"among views [{view}] of the scene" in plan.explain()
-    assert rj.plan(weights, CONFIG, scene, path, context=[2, 0], **options).context == (2, 0)
+def test_a_scene_is_planned_with_the_photos_that_see_the_path(weights, folder, photos):
+    """Two of four: those whose views the path repeats, not those that lie farthest apart. A run with others is refused."""
+    scene, config = load_scene(folder / "scene"), dataclasses.replace(CONFIG, max_context=2)
+    path = photos.cameras[[2, 3, 3, 2, 2]]
+    assert set(select_context(scene, 2)) != {2, 3}
+    plan = rj.plan(weights, config, scene, path, tolerance=0.0, settings=SETTINGS, table=TABLE)
+    assert set(plan.ids) == {2, 3} and plan.choices.photos == (0, 1)
+    assert f"among views {list(plan.ids)} of the scene" in plan.explain()
+    own = sampling.read_photos(scene, plan.ids, config)
+    settings = dataclasses.replace(SETTINGS, steps=2)
+    plan = rj.plan(weights, config, own, path, tolerance=0.0, settings=settings, table=TABLE)
+    run = functools.partial(sampling.sample, weights, config, path=path, settings=settings)
+    assert run(own, plan=plan).windows[0]["photos"] == list(plan.ids)
+    other = sampling.read_photos(scene, [0, 1], config)
+    with pytest.raises(
+        UserError, match=r"made for views \[\d, \d\] of the scene and the photos are views \[0, 1\]"
+    ):
+        run(other, plan=plan)
+    chosen = rj.plan(weights, config, scene, path, tolerance=0.0, context=[1, 0], table=TABLE)
+    assert chosen.ids == (1, 0)
 
 
 def test_coverage_knows_no_unit_and_no_frame(photos, path):
@@ -358,7 +403,7 @@ def test_windows_that_are_not_generated_show_the_rgb_head(weights, photos, path)
 
 
 def run(weights, photos, path, choices, cache, **settings):
-    plan = types.SimpleNamespace(choices=choices, context=photos.ids)
+    plan = types.SimpleNamespace(choices=choices, ids=photos.ids)
     settings = dataclasses.replace(SETTINGS, **settings)
     return sampling.sample(weights, CONFIG, photos, path, settings, plan=plan, cache=cache)
 
@@ -403,6 +448,26 @@ def test_leave_one_out_finds_what_a_perfect_head_would_not_miss(
     key = next(k for k in compiled if k[0] == "leave_one_out" and k[1] == 4)
     known = {key: lambda params, batch: (truth, np.zeros(2))}
     assert proxies.leave_one_out(weights, CONFIG, photos, known)["leave_one_out"] < 1e-6
+
+
+def test_richardson_is_the_distance_of_two_steps_from_four(photos, path, monkeypatch):
+    """A sampler whose every number is the count of its evaluations; and it is measured where it may cost that much."""
+    seen = []
+
+    def generate(params, prepared, noise, *, config, solver, mode):
+        seen.append((len(solver.sigma), config.recon_height, mode))
+        return jax.numpy.full_like(noise, len(solver.sigma)), None
+
+    monkeypatch.setattr(proxies.model, "prepare", lambda params, views, config: views)
+    monkeypatch.setattr(proxies.model, "generate", generate)
+    assert proxies.richardson({}, CONFIG, photos, path, SETTINGS, {}) == pytest.approx(2.0)
+    assert seen == [(2, CONFIG.recon_height // 2, SETTINGS.slots), (4, *seen[0][1:])]
+    price = proxies.richardson_price(CONFIG, 4)
+    for most, measured in ((0.999 * price, False), (1.001 * price, True)):
+        monkeypatch.setattr(proxies, "leave_one_out_price", lambda config, m: np.inf)
+        found = proxies.measure({}, CONFIG, photos, path, SETTINGS, most, {})
+        assert ("richardson" in found.values) == measured
+        assert found.flops == (price if measured else 0.0)
 
 
 def test_what_costs_more_than_its_share_is_not_measured(make):

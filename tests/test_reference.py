@@ -1,6 +1,7 @@
 """The implicit reference: tableaux, orders, stiff problems, and when it refuses to answer."""
 
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from roge_jax.errors import UserError
-from roge_jax.video import flow, testbed
+from roge_jax.video import flow, reference, testbed
 from roge_jax.video.reference import (
     ReferenceRejected,
     integrate,
@@ -107,6 +108,19 @@ def test_failed_steps_are_reported_not_hidden():
     assert int(report["first"]) == 4 and int(report["failed"]) == 4
 
 
+def test_a_step_that_ran_out_of_iterations_is_a_failed_step():
+    """Its numbers are finite and nearly right: only the solver's status tells."""
+    grid = flow.schedule("graded", 12, power=3)
+    with jax.enable_x64(True):
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4)))
+        for most, failed in ((3, 12), (100, 0)):
+            x0, report = integrate(
+                *(tight.velocity, x1, grid), stages=4, stepper="picard", max_iterations=most
+            )
+            assert np.isfinite(x0).all() and int(report["failed"]) == failed
+            assert int(report["first"]) == (0 if failed else -1)
+
+
 tight = testbed.gaussian([0.3, -1.0, 2.0, 0.1], [0.02, 0.3, 1.0, 1.5])
 
 
@@ -200,6 +214,60 @@ def test_reference_refuses_unconverged_steps():
         problem, start = testbed.dahlquist(-1e6)  # Picard contracts only for |h rate| below ~1
         with pytest.raises(ReferenceRejected, match="did not converge, the first from sigma 1"):
             reference_solution(problem.velocity, start, stepper="picard", doublings=0)
+
+
+# (grid points, family, stages) of the candidates that are spoiled, and the only comparison that can see it
+SPOILED = {
+    "halved step": lambda points, family, stages: points == 49,
+    "higher order": lambda points, family, stages: (family, stages) == ("radau", 4),
+    "other family": lambda points, family, stages: family == "gauss",
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_each_of_the_three_comparisons_rejects_alone(name, monkeypatch):
+    """Weights of some candidates that are off by 1e-4: two comparisons are between equals, the third is not."""
+    plan = reference._plan
+
+    def spoiled(grid, family, stages, inside):
+        padded, count, (a, b, c), last = plan(grid, family, stages, inside)
+        worse = 1.0001 if SPOILED[name](len(grid), family, stages) else 1.0
+        return padded, count, (a, worse * b, c), last
+
+    with jax.enable_x64(True):
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4)))
+        run = functools.partial(
+            reference_solution, tight.velocity, x1, stepper="picard", steps=48, doublings=0
+        )
+        assert run(tolerance=1e-6).steps == 96
+        monkeypatch.setattr(reference, "_plan", spoiled)
+        with pytest.raises(ReferenceRejected) as caught:
+            run(tolerance=1e-6)
+    found = re.findall(r"(\w+ \w+) (\d\.\d+e-\d+)", str(caught.value))
+    gaps = {word: float(gap) for word, gap in found}
+    assert gaps.keys() == SPOILED.keys()
+    assert {word for word, gap in gaps.items() if gap > 1e-6} == {name}
+
+
+def test_reference_refuses_candidates_that_agree_when_a_step_of_one_failed(monkeypatch):
+    walker = reference._walker
+
+    def failing(*arguments):
+        walk = walker(*arguments)
+
+        def one_failed(x1, grid, count, main, last):
+            x0, report = walk(x1, grid, count, main, last)
+            if len(main[2]) == 5:  # the candidate of higher order
+                report = report | {"failed": jnp.int32(1), "first": jnp.int32(2)}
+            return x0, report
+
+        return one_failed
+
+    with jax.enable_x64(True):
+        x1 = jnp.asarray(np.random.default_rng(0).normal(size=(2, 4)))
+        monkeypatch.setattr(reference, "_walker", failing)
+        with pytest.raises(ReferenceRejected, match=r"higher order: 1 of .* did not converge"):
+            reference_solution(tight.velocity, x1, stepper="picard", steps=48, doublings=0)
 
 
 def test_reference_never_looks_at_zero():

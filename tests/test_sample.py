@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import types
 
 import jax
 import numpy as np
@@ -714,13 +713,13 @@ def test_wrong_arguments_from_python_are_named(weights, photos):
     with pytest.raises(UserError, match=r"make them with sampling\.read_photos"):
         sampling.sample(weights, CONFIG, small, path, SETTINGS)
     size = (CONFIG.recon_height, CONFIG.recon_width)
-    for views, generate, said in (
-        (photos.ids, ((0, WINDOW), (WINDOW, 2 * WINDOW)), "2 windows"),
-        ((3, 5), ((0, WINDOW),), r"made for views \[3, 5\] of the scene and the photos are views"),
+    for kept, generate, said in (
+        ((0,), ((0, WINDOW), (WINDOW, 2 * WINDOW)), "2 windows"),
+        ((7,), ((0, WINDOW),), "photo 7 of 4"),
     ):
-        choices = sampling.Choices((0,), 2, "euler", "uniform", size, 1, generate, WINDOW)
-        plan = types.SimpleNamespace(choices=choices, context=views)
+        choices = sampling.Choices(kept, 2, "euler", "uniform", size, 1, generate, WINDOW)
         with pytest.raises(UserError, match=said):
+            plan = type("P", (), {"choices": choices, "ids": photos.ids})
             sampling.sample(weights, CONFIG, photos, path, SETTINGS, plan=plan)
 
 

@@ -229,6 +229,20 @@ def test_adaptive_steps_stop_thrashing_when_the_jump_is_named():
     assert int(calm.evaluations) < int(thrash.evaluations)
 
 
+@pytest.mark.parametrize("above", [True, False])
+def test_adaptive_steps_look_at_a_named_jump_from_their_own_side(above):
+    """Piecewise constant slopes: exact without a rejection, whichever piece the jump itself belongs to."""
+
+    def velocity(x, sigma):
+        return jnp.where((sigma > 0.5) | (above & (sigma == 0.5)), 1.0, -3.0) * jnp.ones_like(x)
+
+    grid = [1.0, 0.9, 0.5, 0.1, 0.0]
+    x0, info = solve("bosh3", velocity, jnp.zeros(2), grid, breaks=(0.5,), tolerance=1e-4)
+    raise_if_failed(info)
+    assert int(info.rejected) == 0
+    np.testing.assert_allclose(x0, -0.5 * 1.0 + 0.5 * 3.0, atol=1e-5)
+
+
 def test_adaptive_budget_is_a_named_failure():
     problem = testbed.random_mixture(4, 4, 0.02)
     _, info = solve(

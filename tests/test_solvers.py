@@ -277,6 +277,10 @@ def test_adaptive_loop_stops_at_a_nan():
     _, info = jax.jit(lambda x: solve("bosh3", velocity, x, grid))(jnp.ones((2, 3)))
     jax.effects_barrier()
     check_named_failure(info, called, 0.55, 6)
+    # with two levels there is the closing Euler step alone
+    _, info = solve("bosh3", lambda x, sigma: x * jnp.nan, jnp.ones((2, 3)), [1.0, 0.0])
+    with pytest.raises(SamplingError, match=r"velocity .* not finite at step 0, sigma 1: 6 of 6"):
+        raise_if_failed(info)
 
 
 def test_overflowing_state_is_named():
@@ -359,6 +363,24 @@ def test_projection_holds_known_slots_at_every_stage(name):
         got = np.asarray(x0)
     assert got[0] == KNOWN[0]
     np.testing.assert_allclose(got, want, atol=allowed)
+
+
+def test_known_slots_have_no_say_in_the_adaptive_steps():
+    """The network's velocity there is nonsense, however large: it must not shorten a step."""
+    grid = schedule("graded", 6, sigma_min=0.05)
+
+    def run(nonsense):
+        def velocity(x, sigma):
+            return jnp.where(FIRST, nonsense * jnp.cos(9.0 * sigma), x - x[0])
+
+        with jax.enable_x64(True):
+            x1 = jnp.asarray(NOISE)
+            x0, info = solve("bosh3", velocity, x1, grid, project=hold_first)
+            return np.asarray(x0), int(info.evaluations), int(info.rejected)
+
+    (small, *cost), (large, *same) = run(1.0), run(1e3)
+    assert cost == same
+    np.testing.assert_array_equal(small, large)
 
 
 def test_projection_in_the_compiled_loop_equals_the_python_loop():

@@ -65,7 +65,7 @@ def run(weights, photos, cache):
     def sample(path, generate, frames, **settings):
         choices = full_choices(photos, CONFIG, path, SETTINGS)
         choices = dataclasses.replace(choices, generate=generate, frames=frames)
-        plan = types.SimpleNamespace(choices=choices, context=photos.ids)
+        plan = types.SimpleNamespace(choices=choices, ids=photos.ids)
         own = dataclasses.replace(SETTINGS, **settings)
         return sampling.sample(weights, CONFIG, photos, path, own, plan=plan, cache=cache)
 

@@ -305,10 +305,20 @@ def _variants(ax, rows: dict[str, dict], unit: float, word: str) -> None:
     ax.legend(fontsize=7, ncols=3, loc="upper center", columnspacing=0.8)
 
 
+CONDITIONS = {
+    "all conditions": "k",
+    "rays": "C0",
+    "ray features": "C1",
+    "preview": "C2",
+    "ray features and preview": "C3",
+    "context latents": "C4",
+}
+
+
 def _conditions(ax, row: dict) -> None:
     whole = np.mean(row["errors"]["all conditions"], 0)
     words = [n for n in row["errors"] if n.endswith(": zero")]
-    styles = {n: (f"C{k}", "-") for k, n in enumerate(words)}
+    styles = {n: (CONDITIONS[n.removesuffix(": zero")], "-") for n in words}
     styles |= {n.replace("zero", "another scene's"): (c, "--") for n, (c, _) in styles.items()}
     for name, (colour, line) in styles.items():
         rise = 100 * (np.mean(row["errors"][name], 0) / whole - 1)
@@ -321,15 +331,17 @@ def _conditions(ax, row: dict) -> None:
     count = len(row["errors"]["all conditions"])
     ax.set_title(f"a condition taken away at test time (n = {count})", fontsize=10)
     ax.grid(True, alpha=0.3)
-    ax.set_ylim(top=1e5)  # room for the legend
+    ax.set_ylim(top=2e6)  # room for the legend
+    ax.set_yticks([-1, -0.1, 0, 0.1, 1, 10, 100, 1000, 10000])
     ax.legend(fontsize=6, ncols=2, loc="upper center", columnspacing=0.8)
 
 
 def _finetune(ax, row: dict) -> None:
-    for k, name in enumerate(row["after"]):
+    for name in row["after"]:
+        colour = CONDITIONS[name.removeprefix("without ")]
         for when, line in (("before", ":"), ("after", "-")):
             errors = np.mean(row[when][name], 0)
-            ax.plot(row["sigmas"], errors, color=f"C{k}", ls=line, marker="o", ms=3,
+            ax.plot(row["sigmas"], errors, color=colour, ls=line, marker="o", ms=3,
                     label=name if when == "after" else None)  # fmt: skip
     ax.plot([], [], color="0.4", ls=":", label="dotted: before")
     steps = row["clocks"]["all conditions"]["steps"]

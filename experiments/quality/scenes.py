@@ -6,7 +6,6 @@ of the target slots is the same for every M. Noise comes from (scene, 0) through
 """
 
 import functools
-import hashlib
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -17,7 +16,6 @@ import numpy as np
 
 from roge_jax import model
 from roge_jax.config import RoGeConfig
-from roge_jax.core.params import flatten
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import make_sample
 from roge_jax.evaluate import spread
@@ -206,16 +204,3 @@ def _compiled(config: RoGeConfig):
 def most_steps(solver: str, budget: int) -> int:
     """The most steps within a budget of evaluations, 0 if none."""
     return max((n for n in range(1, budget + 1) if solvers.nfe(solver, n) <= budget), default=0)
-
-
-def fingerprint(params: Any) -> str:
-    """Twelve hexadecimal digits that change with the name, shape or any number of any leaf.
-
-    Every part has a say in a sampled video: the reconstruction (encoder, renderer) and the fusion make the condition, the
-    transformer the velocity, the VAE the photos' latents and the preview.
-    """
-    digest = hashlib.sha256()
-    for path, leaf in sorted(flatten(params).items()):
-        digest.update(f"{path} {leaf.shape} ".encode())
-        digest.update(np.asarray(leaf, np.float32).tobytes())
-    return digest.hexdigest()[:12]

@@ -46,13 +46,12 @@ class Purchase(NamedTuple):
 class Plan:
     """What a run uses and what that is expected to cost and to lose. Give it to `sampling.sample`.
 
-    `context`: the views of the scene that the full model sees; `choices.photos` are positions among them.
     `predicted_error`: RMS in colours from 0 to 1 against the full model. FLOPs: `predicted_cost` of the run,
     `full_cost` of the full model's, `planning_cost` of measuring the scene beforehand.
     """
 
     choices: Choices
-    context: tuple[int, ...]
+    ids: tuple[int, ...]  # views of the scene, all that the full model sees
     frames: int  # of the path
     tolerance: float
     max_cost: float | None
@@ -74,8 +73,8 @@ class Plan:
             f"({100 * part:.0f} %), {cost.scaled(self.planning_cost, 'FLOP')} for planning",
             f"  {_named(self.choices)}; {_generated(self.choices, self.frames)}",
         ]
-        if self.context != tuple(range(len(self.context))):
-            lines.append(f"  photos are numbered among views {list(self.context)} of the scene")
+        if self.ids != tuple(range(len(self.ids))):
+            lines.append(f"  photos are numbered among views {list(self.ids)} of the scene")
         lines += [f"  {'bought' if i else 'start '}  {_line(p)}" for i, p in enumerate(self.bought)]
         if self.refused is not None:
             lines.append(f"  refused {_line(self.refused)}")
@@ -106,9 +105,9 @@ def plan(
     """The cheapest plan that is expected to stay within `tolerance`, or the best one within `max_cost`.
 
     Args:
-      scene: `Photos`, all of which the full model sees, or a scene: its views `context`, by default those that see most
-        of the path (`coverage.see_path`), as many as the model takes. `Plan.context` are the full model's photos, and
-        the plan's own photos are positions among them.
+      scene: `Photos`, all of which the full model sees, or a scene: its views `context`, by default as many as the
+        model takes and those that see most of the path (`coverage.see_path`). The plan's `ids` are these views and its
+        photos positions among them: `read_photos(scene, plan.ids, config)` makes what `sample` takes.
       path: the cameras to be rendered, as for `sample`.
       tolerance: RMS difference to the full model's frames, colours from 0 to 1; 0 is the full model, bit for bit.
       max_cost: FLOPs of planning and run together; beyond it the tolerance is given up, which `notes` says.
@@ -120,7 +119,7 @@ def plan(
     """
     _check(tolerance, max_cost)
     settings = (Settings() if settings is None else settings).of(config)
-    photos = scene if isinstance(scene, Photos) else photos_of(scene, config, path, context)
+    photos = scene if isinstance(scene, Photos) else photos_of(scene, config, context, path)
     full = full_choices(photos, config, path, settings)
     table = load(config.name) if table is None else table
     measured, worth = proxies.Measured({}, 0.0), None
@@ -155,7 +154,7 @@ def plan(
         )
     return Plan(
         choices=chosen.choices,
-        context=tuple(photos.ids),
+        ids=tuple(photos.ids),
         frames=len(path),
         tolerance=float(tolerance),
         max_cost=None if max_cost is None else float(max_cost),
@@ -180,13 +179,13 @@ def _check(tolerance: float, max_cost: float | None) -> None:
 
 
 def photos_of(
-    scene: Scene, config: RoGeConfig, path: Cameras, context: Sequence[int] | None
+    scene: Scene, config: RoGeConfig, context: Sequence[int] | None, path: Cameras
 ) -> Photos:
-    """The photos of the full model."""
+    """The photos of the full model: the views `context`, or those that see most of the path, best first."""
     if context is None:
-        size = config.height, config.width
-        context = coverage.see_path(scene, path, config.max_context, *size)
-    return read_photos(scene, list(context), config)
+        most = min(len(scene), config.max_context)
+        context = coverage.see_path(scene, path, most, config.height, config.width)
+    return read_photos(scene, context, config)
 
 
 def _named(c: Choices) -> str:
