@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from roge_jax import evaluate, model, preview, programs, sampling
-from roge_jax.data import procedural
+from roge_jax.data import coverage, procedural
 from roge_jax.data.raycast import OBJECTS, ROOM, render_views
 from roge_jax.geometry.cameras import Cameras, normalise
-from roge_jax.planning import coverage, proxies, stretches
+from roge_jax.planning import proxies, stretches
 from roge_jax.planning.options import LEAST_LOSS, MERGES, full_choices
 from roge_jax.video import flow, solvers
 from roge_jax.windows import stretch_noise, window_views

@@ -27,6 +27,7 @@ from .choices import Choices, Planned, around, spans
 from .config import RoGeConfig
 from .core import sharding
 from .core.params import Tree
+from .data.coverage import see_path
 from .data.overlap import select_overlapping
 from .data.scene import Scene, distinct_views, select_context
 from .data.scene import prepare as prepare_photos
@@ -116,11 +117,16 @@ class Result:
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
-def context_ids(text: str | None, scene: Scene, config: RoGeConfig) -> list[int]:
-    """The views that --context asks for: how many, or which by number or name; without a word, up to 6."""
+def context_ids(
+    text: str | None, scene: Scene, config: RoGeConfig, path: Cameras | None = None
+) -> list[int]:
+    """The views that --context asks for: how many, or which by number or name; without a word, up to 6.
+
+    Those that it leaves open are chosen for the `path` where that is known before (K in pixels of the model's size).
+    """
     most = config.max_context
     if text is None:
-        return _chosen(scene, min(len(scene), most, DEFAULT_CONTEXT), config)
+        return _chosen(scene, min(len(scene), most, DEFAULT_CONTEXT), config, path)
     words = [word.strip() for word in text.split(",")]
     if any(words) and ("," in text or text in scene.names):
         return [_view(word, scene) for word in words if word]
@@ -129,11 +135,13 @@ def context_ids(text: str | None, scene: Scene, config: RoGeConfig) -> list[int]
             f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
             f"model takes {most}), or photos by number or name, separated by commas."
         )
-    return _chosen(scene, int(text), config)
+    return _chosen(scene, int(text), config, path)
 
 
-def _chosen(scene: Scene, count: int, config: RoGeConfig) -> list[int]:
-    """So many photos of a scene that hang together; all of them where there are no more."""
+def _chosen(scene: Scene, count: int, config: RoGeConfig, path: Cameras | None) -> list[int]:
+    """So many photos of a scene: those that see most of the path, or that hang together; all where there are no more."""
+    if path is not None and count < len(scene):
+        return see_path(scene, path, count, config.height, config.width)
     if count in (1, len(scene)):
         return select_context(scene, count)
     return select_overlapping(scene, count, config.height, config.width)

@@ -14,11 +14,12 @@ from scene_files import nerfstudio, truth
 import roge_jax as rj
 from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.config import preset
+from roge_jax.data import coverage
 from roge_jax.data.scene import load_scene, select_context
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import make_path
-from roge_jax.planning import coverage, proxies, table
+from roge_jax.planning import proxies, table
 from roge_jax.planning.options import full_choices, list_options
 from roge_jax.recon.ray_scene import attend, merge_scene
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scene_files import nerfstudio, truth
 
-from roge_jax import checkpoint, entry, model, sample, sampling, video_io
+from roge_jax import checkpoint, entry, inputs, model, sample, sampling, video_io
 from roge_jax.config import preset
-from roge_jax.data.scene import load_scene, open_scene
+from roge_jax.data.scene import cameras_at, load_scene, open_scene
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.geometry.trajectories import make_path
@@ -374,22 +374,22 @@ def test_context_words(text, ids, place):
 
 def test_the_path_goes_through_the_photos_and_around_a_single_one(photos):
     args = arguments("--frames", 5)
-    path = sample.camera_path(args, photos.cameras, CONFIG)
-    assert args.trajectory == sample.THROUGH  # for run.json
+    path = inputs.camera_path(args, photos.cameras, CONFIG)
+    assert args.trajectory == inputs.THROUGH  # for run.json
     ends = [np.abs(path.c2w - pose).max((1, 2)).argmin() for pose in photos.cameras.c2w]
     assert {0, 4} <= set(ends) and np.abs(path.c2w[0] - photos.cameras.c2w).max((1, 2)).min() < 1e-9
     args = arguments("--frames", 5)
-    path = sample.camera_path(args, photos.cameras[:1], CONFIG)
-    assert args.trajectory == sample.ALONE
+    path = inputs.camera_path(args, photos.cameras[:1], CONFIG)
+    assert args.trajectory == inputs.ALONE
     np.testing.assert_allclose(path.c2w[0], photos.cameras.c2w[0], atol=1e-9)
     assert np.ptp(path.c2w[:, :3, 3], 0).max() > 0
 
 
 def test_field_of_view_and_size(place, photos):
     args = arguments("--fov", 90, "--frames", 4)
-    path = sample.camera_path(args, photos.cameras, CONFIG)
+    path = inputs.camera_path(args, photos.cameras, CONFIG)
     np.testing.assert_allclose(path.K[3], [[16, 0, 24], [0, 16, 16], [0, 0, 1]], atol=1e-12)
-    config = sample.model_config(
+    config = inputs.model_config(
         arguments("--checkpoint", place / "model", "--size", "48x64"), weights=True
     )
     assert (config.height, config.width, config.recon_height, config.recon_width) == (
@@ -405,10 +405,32 @@ def test_path_files_are_followed(tmp_path, photos):
 
     path = make_path("spiral", photos.cameras, 7)
     save_path(tmp_path / "path.json", path, CONFIG.height, CONFIG.width)
-    found = sample.camera_path(
+    found = inputs.camera_path(
         arguments("--trajectory", tmp_path / "path.json"), photos.cameras, CONFIG
     )
     np.testing.assert_allclose(found.c2w, path.c2w, atol=1e-12)
+
+
+def test_photos_are_chosen_for_a_path_that_is_known(tmp_path, place):
+    """Of four photos two: those that stand where the path file goes, and not the same for another path."""
+    from roge_jax.geometry.paths import save_path
+
+    scene = load_scene(place / "scene")
+    settings = SETTINGS.of(CONFIG)
+    near = cameras_at(scene, CONFIG.height, CONFIG.width)
+    without = inputs.read_inputs(
+        arguments("--scene", place / "scene", "--context", 2), CONFIG, settings
+    )[1]
+    for views in ([0, 1], [2, 3]):
+        save_path(tmp_path / "path.json", near[views], CONFIG.height, CONFIG.width)
+        words = ["--scene", place / "scene", "--trajectory", tmp_path / "path.json"]
+        _, photos, path = inputs.read_inputs(
+            arguments(*words, "--context", 2), CONFIG, settings, scene
+        )
+        assert sorted(photos.ids) == views != sorted(without.ids)
+        assert len(path) == 2
+        _, photos, _ = inputs.read_inputs(arguments(*words, "--context", "3,0"), CONFIG, settings)
+        assert photos.ids == (3, 0)
 
 
 def test_convention_reaches_the_reader(place, monkeypatch):

@@ -14,10 +14,11 @@ from test_planning import TABLE
 import roge_jax as rj
 from roge_jax import cost, model, programs, sampling, windows
 from roge_jax.config import preset
+from roge_jax.data import coverage
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.geometry.trajectories import make_path
-from roge_jax.planning import coverage, stretches
+from roge_jax.planning import stretches
 from roge_jax.planning.options import Prices, full_choices, list_options
 
 CONFIG = dataclasses.replace(preset("tiny"), frames=9)

@@ -24,6 +24,7 @@ from roge_jax.geometry.cameras import (
     Cameras,
     CameraWarning,
     crop_resize,
+    crop_resize_K,
     scale_K,
     to_host,
     turn,
@@ -33,6 +34,7 @@ from roge_jax.geometry.validation import Finding
 
 __all__ = [
     "Scene",
+    "cameras_at",
     "distinct_views",
     "load_scene",
     "open_scene",
@@ -254,6 +256,13 @@ def _procedural(name: str, frames: int, height: int, width: int, supersample: in
     names = tuple(f"{i:04d}" for i in range(len(images)))
     cameras = to_host(Cameras(made["K"], made["c2w"]))
     return Scene(images, cameras, names, name, depths=list(np.asarray(made["depth"])))
+
+
+def cameras_at(scene: Scene, height: int, width: int) -> Cameras:
+    """The cameras of all views as `prepare` returns them, without reading a photo."""
+    sizes = zip(scene.cameras.K, scene.sizes, strict=True)
+    K = [crop_resize_K(K, size, (height, width)) for K, size in sizes]
+    return Cameras(np.stack(K), scene.cameras.c2w)
 
 
 def prepare(

@@ -14,12 +14,13 @@ import numpy as np
 from .. import cost
 from ..choices import Choices, around
 from ..config import RoGeConfig
+from ..data import coverage
 from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling import Photos, Settings
 from ..video import flow, solvers
 from ..windows import chained, windows
-from . import coverage, proxies, stretches
+from . import proxies, stretches
 from .table import Table
 from .table import scale as factor
 

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..data.scene import Scene
 from ..geometry.cameras import Cameras, to_host
-from ..geometry.crops import crop_resize_K
 from ..geometry.rays import plucker_float64, project
 from ..geometry.trajectories import focus_distance
+from .scene import Scene, cameras_at
 
 FRAMES, GRID = 9, (4, 7)  # target views and rays of each that are looked at
 DEPTHS = (0.5, 0.8, 1.25, 2.0, 4.0)  # in distances in focus
@@ -81,11 +80,7 @@ def see_path(scene: Scene, path: Cameras, m: int, height: int, width: int) -> li
     For scenes of many photos, before they are read: `read_photos(scene, see_path(scene, path, 6, ...), config)`. Fewer
     than m if further photos would add nothing. The path's K is in pixels of height x width.
     """
-    K = [
-        crop_resize_K(K, size, (height, width))
-        for K, size in zip(scene.cameras.K, scene.sizes, strict=True)
-    ]
-    worth = coverage(Cameras(np.stack(K), scene.cameras.c2w), path, height, width)
+    worth = coverage(cameras_at(scene, height, width), path, height, width)
     chosen = selections(worth, m)[-1]
     return [chosen[i] for i, _ in greedy(worth[list(chosen)])]
 
