@@ -24,7 +24,7 @@ from .core.lora import merged
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
 from .fields import exists, is_file, read_json
-from .folders import fingerprint, put, sync
+from .folders import fingerprint, put, share, sync
 
 SHARD_BYTES = 15_000_000
 PIECE_BYTES = 16_000_000  # of a leaf that are written at a time
@@ -331,6 +331,7 @@ def save_adapter(
     }
     check_adapter(unflatten(leaves), config, source="the adapter")
     save_file(leaves, temporary / ADAPTER)
+    share(temporary / ADAPTER)
     record = {
         "format": 1,
         "kind": "adapter",
