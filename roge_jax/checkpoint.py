@@ -6,6 +6,7 @@ A model is a folder: `config.json` (the whole configuration and where the weight
 
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,11 +19,12 @@ import numpy as np
 
 from . import model
 from .config import PRESETS, RoGeConfig, from_dict, to_dict
+from .core import memory
 from .core.lora import merged
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
 from .fields import exists, is_file, read_json
-from .folders import fingerprint, put, sync
+from .folders import fingerprint, put, share, sync
 
 SHARD_BYTES = 15_000_000
 PIECE_BYTES = 16_000_000  # of a leaf that are written at a time
@@ -219,10 +221,12 @@ def load_model(
 
     Floating leaves come in `dtype`, which may be a function of the path; None: as they are stored. With `shardings`
     (a tree as of `core.sharding.shardings`) every device gets its share of a leaf straight from the file; without,
-    leaves are whole. Host memory beside the arrays themselves holds one leaf at a time.
+    leaves are whole. Host memory beside the arrays themselves holds one leaf at a time. Raises: UserError if they
+    are more than the memory has room for, before one is read.
     """
     tree, config = open_model(name)
     wanted = dtype if callable(dtype) and not isinstance(dtype, type) else lambda path: dtype
+    _check_memory(str(name), tree, wanted, shardings)
     return placed(tree, wanted, shardings), config
 
 
@@ -269,6 +273,27 @@ def placed(tree: Tree, dtype: Callable[[str], Any], shardings: Tree | None = Non
     return unflatten({path: _placed(x, dtype(path), where.get(path)) for path, x in flat.items()})
 
 
+def _check_memory(
+    name: str, tree: Tree, dtype: Callable[[str], Any], shardings: Tree | None
+) -> None:
+    """Raise UserError if the leaves do not fit: their shares each device, or all of them a host whose memory it is."""
+    where = {} if shardings is None else flatten(shardings)
+    devices = {d for one in where.values() for d in one.addressable_devices} or {jax.devices()[0]}
+    room = memory.own_memory(sorted(devices, key=lambda d: d.id))
+    needed = 0
+    for path, leaf in flatten(tree).items():
+        shape, whole = leaf.shape, room is None or path not in where
+        shape = shape if whole else where[path].shard_shape(shape)
+        needed += math.prod(shape) * _kind(leaf, dtype(path)).itemsize
+    smaller = "or take a smaller model"
+    if room is not None:
+        cure = f"split them over more devices, --mesh fsdp=N, {smaller}"
+        memory.refuse(name, needed, memory.DEVICE, room, "weights", cure)
+    else:
+        cure = f"close other programs, {smaller}"
+        memory.refuse(name, needed, memory.HOST, memory.memory_available(), "weights", cure)
+
+
 def _placed(leaf: Any, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
     """A copy of a leaf on its devices. Conversion is NumPy's: JAX would compile one for every shape."""
     value, wanted = np.asarray(leaf), _kind(leaf, dtype)
@@ -306,6 +331,7 @@ def save_adapter(
     }
     check_adapter(unflatten(leaves), config, source="the adapter")
     save_file(leaves, temporary / ADAPTER)
+    share(temporary / ADAPTER)
     record = {
         "format": 1,
         "kind": "adapter",

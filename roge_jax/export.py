@@ -173,6 +173,7 @@ def write_lora(tree, config, style: str, out: Path) -> None:
 
     from .core.params import flatten, unflatten
     from .errors import UserError
+    from .folders import share
     from .weights.importer import check_output
     from .weights.lora_export import export_lora
 
@@ -187,6 +188,7 @@ def write_lora(tree, config, style: str, out: Path) -> None:
     part = check_output(out)
     part.mkdir(parents=True, exist_ok=True)
     save_file(tensors, part / FILES[style], metadata={"format": "pt"})
+    share(part / FILES[style])
     rank = next(x.shape[-1] for p, x in flat.items() if p.endswith("lora_a"))
     if style == "peft":
         names = sorted(

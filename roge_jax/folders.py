@@ -69,6 +69,14 @@ def put(temporary: Path, final: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def share(file: Path) -> None:
+    """Give a file the rights of any new one: safetensors writes files that their owner alone may read."""
+    probe = file.with_name(file.name + ".rights")
+    probe.touch()
+    file.chmod(probe.stat().st_mode)
+    probe.unlink()
+
+
 def sync(path: Path) -> None:
     """A file, or a folder and all below it, is on the disk when this returns."""
     for place in [*(path.rglob("*") if path.is_dir() else []), path]:

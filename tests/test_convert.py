@@ -19,7 +19,7 @@ import pytest
 
 from roge_jax import checkpoint, convert, model
 from roge_jax.config import to_dict
-from roge_jax.core import params
+from roge_jax.core import memory, params
 from roge_jax.entry import parse
 from roge_jax.errors import UserError
 from roge_jax.weights import importer, lora_export, shards, sources, wan_dit
@@ -438,6 +438,15 @@ def test_a_pickle_cannot_execute_code(tmp_path, call):
         sources.open_source(pytorch_zip(tmp_path / "model.pt", b"nonsense"))
 
 
+@pytest.mark.parametrize(
+    "name", ["ComplexFloatStorage", "QInt8Storage", "float8_e5m2fnuz", "complex64"]
+)
+def test_other_kinds_of_numbers_are_no_attack(tmp_path, name):
+    file = pytorch_zip(tmp_path / "model.pt", f"ctorch\n{name}\n.".encode())
+    with pytest.raises(UserError, match=f"tensors of type {name.removesuffix('Storage')}, which"):
+        sources.open_source(file)
+
+
 # ---- bad input -----------------------------------------------------------------------------------
 
 
@@ -585,14 +594,29 @@ def t5_folder(folder: Path, without: str = "") -> Path:
     """A diffusers folder that looks like umT5, of which nothing can be read."""
     parts = {
         "text_encoder/config.json": '{"model_type": "umt5"}',
-        "text_encoder/model.safetensors": "",
+        "text_encoder/model.safetensors": None,
         "tokenizer/tokenizer.json": "{}",
     }
     for name, content in parts.items():
         if name != without:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(content)
+            if content is None:
+                made.save_headers(folder / name, {"shared.weight": (1000, 2)})
+            else:
+                (folder / name).write_text(content)
     return folder
+
+
+def test_a_text_encoder_that_memory_does_not_hold(files, tmp_path, monkeypatch):
+    plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
+    for free, fits in ((4000.0, True), (3999.0, False)):  # 2000 values in bfloat16
+        monkeypatch.setattr(memory, "memory_available", lambda free=free: free)
+        if fits:
+            run(*plain, "--t5", t5, "--dry-run")
+        else:
+            fails("for the text encoder alone: close other programs", *plain, "--t5", t5)
+    (t5 / "text_encoder/model.safetensors").write_bytes(b"cut")
+    fails(r"model\.safetensors is not a safetensors file", *plain, "--t5", t5)
 
 
 def test_options_of_the_prompt_that_would_be_ignored(files, tmp_path, capsys):

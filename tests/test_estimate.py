@@ -127,6 +127,8 @@ def test_a_whole_step_takes_what_xla_says(name):
     # Exact, but for the random key that XLA counts as well.
     assert 0 <= found["arguments"] - held <= 64
     assert abs(found["planned_over_xla"]["all"] - 1) < 0.15, found
+    if name == "mini":  # in `tiny` one leaf's copy during the update is a third of it
+        assert abs(found["planned_over_xla"]["temporary"] - 1) < 0.15, found
 
 
 def test_the_papers_step_fits_80_gb_with_the_default_recomputation():

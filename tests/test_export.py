@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import stat
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +50,19 @@ def run(*arguments):
     export.main(parse(export.parser(), [str(a) for a in arguments]))
 
 
+def rights(file: Path) -> int:
+    return stat.S_IMODE(file.stat().st_mode)
+
+
+def usual(folder: Path) -> int:
+    """The rights of a new file: others on a shared machine must be able to read what is handed on."""
+    file = folder / "usual"
+    file.touch()
+    found = rights(file)
+    file.unlink()
+    return found
+
+
 def test_adapter_there_and_back(adapter, tmp_path):
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL, PROVENANCE)
     tree, config = checkpoint.load_adapter(tmp_path / "a")
@@ -71,6 +86,7 @@ def test_adapter_there_and_back(adapter, tmp_path):
         "rank 3",
     ):
         assert words in card, words
+    assert rights(tmp_path / "a" / "adapter.safetensors") == usual(tmp_path)
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL)  # replaces it
     assert "not recorded" in (tmp_path / "a" / "README.md").read_text()
     assert [p.name for p in tmp_path.iterdir()] == ["a"]
@@ -133,6 +149,7 @@ def test_lora_of_the_transformer_for_other_programs(adapter, tmp_path, style, ca
     tensors = load_file(tmp_path / "out" / export.FILES[style])
     back, rest = lora_export.import_lora(tensors, SMALL.dit)
     assert not rest
+    assert rights(tmp_path / "out" / export.FILES[style]) == usual(tmp_path)
     want = {p: x for p, x in params.flatten(adapter["dit"]).items() if "lora_" in p}
     back = params.flatten(back)
     assert back.keys() == want.keys()

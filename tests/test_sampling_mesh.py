@@ -13,7 +13,7 @@ from test_sharding import drawn, small
 
 from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.checkpoint import find_model, load_config, load_model, save_model
-from roge_jax.core import sharding
+from roge_jax.core import memory, sharding
 from roge_jax.core.params import abstract, flatten
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
@@ -91,6 +91,37 @@ class TestLoading:
         tracemalloc.stop()
         assert len(jax.tree.leaves(params)) == len(sizes)
         assert peak - kept < max(sizes) + 2e6 < sum(sizes) / 4
+
+    def test_weights_that_memory_does_not_hold_are_refused_before_one_is_read(
+        self, saved, monkeypatch
+    ):
+        folder, cfg = saved
+        mesh = sharding.make_mesh(1, 2, 2, devices=jax.devices()[:4])
+        specs = model.specs(cfg)
+        where = sharding.shardings(specs, mesh)
+        whole = 4.0 * sum(math.prod(s.shape) for s in flatten(specs).values())
+        share = cost.held_weights(cfg, mesh, "float32")
+        assert share < 0.9 * whole
+        read = []
+        monkeypatch.setattr(checkpoint, "_placed", lambda *_: read.append(1))
+        # A host holds all of them once, a device with memory of its own its share.
+        for name, least, given, cure in (
+            ("memory_available", whole, {}, "close other programs"),
+            ("memory_available", whole, {"shardings": where}, "close other programs"),
+            ("own_memory", whole, {}, "fsdp=N"),
+            ("own_memory", share, {"shardings": where}, "fsdp=N"),
+        ):
+            for room, fits in ((least, True), (least - 1.0, False)):
+                with monkeypatch.context() as patched:
+                    patched.setattr(memory, name, lambda *_, room=room: room)
+                    if fits:
+                        load_model(folder, **given)
+                        assert read
+                    else:
+                        with pytest.raises(UserError, match=f"GB, for weights alone: .*{cure}"):
+                            load_model(folder, **given)
+                        assert not read
+                read.clear()
 
     def test_a_misshapen_model_is_refused_before_it_is_read(self, saved, tmp_path):
         _, cfg = saved

@@ -159,7 +159,7 @@ class TestRoom:
         stage = dataclasses.replace(lora(cfg), batch=2)
         said = {}
         for size in (16e9, 24e9, 80e9):
-            monkeypatch.setattr(room, "_own_memory", lambda devices, size=size: size)
+            monkeypatch.setattr(room, "own_memory", lambda devices, size=size: size)
             try:
                 said[size] = room.check_room(stage, cfg, mesh, dtype="bfloat16")
             except UserError as error:

@@ -13,8 +13,8 @@ import jax
 from .. import model
 from ..config import RoGeConfig
 from ..core import sharding
+from ..core.memory import DEVICE, HOST, memory_available, own_memory, refuse
 from ..core.params import count
-from ..errors import UserError
 from ..folders import check_disk
 from . import estimate, loop
 from .stages import Stage, stage_specs
@@ -22,7 +22,7 @@ from .stages import Stage, stage_specs
 GB = 1e9
 # Estimating activations takes seconds to minutes: not done for a model that takes less than this share of the memory.
 SMALL = 0.05
-_HOST = "of memory, of which there are"
+_LASTING, _SMALLER = "weights, optimiser and gradients", "or train a smaller model"
 
 
 def check_layout(
@@ -51,15 +51,18 @@ def check_room(
     lasting = estimate.lasting(config, stage, mesh=mesh, dtype=dtype)
     name = f"Stage {stage.name} of '{config.name}'"
     loaded = 4.0 * count(stage_specs(config, stage)[0])
-    needed, room, own = sum(lasting.values()), _own_memory(devices), True
+    needed, room, own = sum(lasting.values()), own_memory(devices), True
     if room is not None:
-        _refuse(name, needed, "on each device, which has", room, "split the weights, --mesh fsdp=N")
+        cure = f"split the weights, --mesh fsdp=N, {_SMALLER}"
+        refuse(name, needed, DEVICE, room, _LASTING, cure)
         loaded += estimate.largest_frozen(config, stage, dtype=dtype)
-        _refuse(name, loaded, _HOST, memory_available(), "close other programs", "loading")
+        refuse(
+            name, loaded, HOST, memory_available(), "loading", f"close other programs, {_SMALLER}"
+        )
     else:
         own, room = False, memory_available()
         needed = count_here * needed + loaded
-        _refuse(name, needed, _HOST, room, "close other programs")
+        refuse(name, needed, HOST, room, _LASTING, f"close other programs, {_SMALLER}")
     if room is None or needed < SMALL * room:
         return ""
     fused = own and dtype != "float32"
@@ -67,26 +70,11 @@ def check_room(
     taken = found.bytes if own else needed + count_here * (found.bytes - sum(lasting.values()))
     if taken <= room:
         return ""
-    where = "on each device, which has" if own else _HOST
+    where = DEVICE if own else HOST
     return (
         f"{name} is estimated to take {taken / GB:,.3g} GB {where} {room / GB:,.3g} GB, most activations in "
         f"{found.fullest}: if it fails, use more devices, --remat full or a smaller --batch (see --dry-run)"
     )
-
-
-def _refuse(
-    name: str,
-    least: float,
-    where: str,
-    most: float | None,
-    cure: str,
-    what: str = "weights, optimiser and gradients",
-) -> None:
-    if most is not None and least > most:
-        raise UserError(
-            f"{name} needs {least / GB:,.3g} GB {where} {most / GB:,.3g} GB, for {what} alone: {cure}, or train a "
-            "smaller model."
-        )
 
 
 def check_space(
@@ -104,21 +92,5 @@ def check_space(
     check_disk(needed, out, what, held=[out / stage.name for stage, _ in recipe])
 
 
-def memory_available() -> float | None:
-    """Bytes that programs can still get on this machine; None where /proc does not tell."""
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        return next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))
-    except (OSError, StopIteration):
-        return None
-
-
 def _here(device: jax.Device) -> bool:
     return device.process_index == jax.process_index()
-
-
-def _own_memory(devices: Sequence[jax.Device]) -> float | None:
-    """The smallest memory of the devices in bytes; None where they do not tell, as those of a CPU."""
-    stats = [device.memory_stats() or {} for device in devices]
-    limits = [float(found["bytes_limit"]) for found in stats if "bytes_limit" in found]
-    return min(limits, default=None)

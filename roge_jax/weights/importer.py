@@ -161,9 +161,9 @@ def report(faults: Iterable[Fault]) -> None:
     for (file, pattern, what), numbers in groups.items():
         files.setdefault(file, []).append(f"{pattern.replace('{}', _ranges(numbers))} {what}")
     listed = " | ".join(f"{file}: {'; '.join(lines)}" for file, lines in files.items())
+    count = "1 tensor does" if len(faults) == 1 else f"{len(faults)} tensors do"
     raise UserError(
-        f"{len(faults)} tensors do not fit this model. {listed}. "
-        "Check that the files are whole and belong to this preset (--dry-run shows the table)."
+        f"{count} not fit this model. {listed}. Check that the files are whole and belong to this model (--preset)."
     )
 
 

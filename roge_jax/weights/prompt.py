@@ -3,15 +3,18 @@
 Rows are those of umT5's last hidden state, cut to the true length of the prompt; the model stores them zero-padded.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
 
 from ..config import DiTConfig
+from ..core import memory
 from ..errors import UserError
 from ..fields import is_file, read_json
 from .sources import open_source
 
+WEIGHTS = ("model.safetensors", "model.safetensors.index.json")  # whole, or in shards
 EXTRA = "pip install -e '.[convert]' in the project's folder"
 
 
@@ -53,7 +56,7 @@ def read_prompt(file: Path, cfg: DiTConfig) -> np.ndarray:
 
 
 def check_encoder(folder: Path) -> None:
-    """Raise UserError unless `folder` looks like what `encode_prompt` takes; no weight is read."""
+    """Raise UserError unless `folder` looks like what `encode_prompt` takes and memory holds it; no weight is read."""
     encoder, tokens = _places(folder)
     problem, kind = "", None
     if is_file(encoder / "config.json"):
@@ -69,6 +72,15 @@ def check_encoder(folder: Path) -> None:
         problem = f"no tokenizer in {tokens}"
     if problem:
         raise UserError(f"--t5 {folder}: no umT5 encoder and tokenizer there ({problem}).")
+    stored = [encoder / name for name in WEIGHTS if is_file(encoder / name)]
+    if not stored:  # .bin files, which are pickles: transformers reads them
+        return
+    # In bfloat16, whatever type it is stored in.
+    needed = 2 * sum(math.prod(shape) for shape in open_source(stored[0]).shapes.values())
+    cure = "close other programs, or give finished rows with --prompt-embedding"
+    memory.refuse(
+        f"--t5 {folder}", needed, memory.HOST, memory.memory_available(), "the text encoder", cure
+    )
 
 
 def _places(folder: Path) -> tuple[Path, Path]:

@@ -17,6 +17,7 @@ import json
 import math
 import operator
 import pickle
+import re
 import struct
 import zipfile
 from collections.abc import Mapping
@@ -76,6 +77,8 @@ _TORCH_DTYPES = {
     "float8_e4m3fn": "F8_E4M3",
     "float8_e5m2": "F8_E5M2",
 }
+# Kinds of numbers that no weights here are of: complex, quantised, other floats of 8 bits.
+_OTHER_KINDS = re.compile(r"([A-Z]\w+)Storage|((?:complex|float|bits|quint|qint)\d+\w*)")
 
 
 class Stored(NamedTuple):
@@ -201,11 +204,8 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
 
 
 def _first_beyond(tensors: Mapping[str, Stored], size: int) -> str:
-    key, _ = min(
-        ((k, t) for k, t in tensors.items() if t.offset + t.nbytes > size),
-        key=lambda item: item[1].offset,
-    )
-    return f"tensor '{key}'"
+    beyond = [key for key, t in tensors.items() if t.offset + t.nbytes > size]
+    return f"tensor '{min(beyond, key=lambda key: tensors[key].offset)}'"
 
 
 def _stored(file: Path, base: int, key: str, entry: dict) -> Stored:
@@ -306,24 +306,18 @@ def read_torch_header(file: Path) -> dict[str, Stored]:
     except zipfile.BadZipFile:
         with file.open("rb") as f:
             cut = f.read(2) == b"PK"
-        what = (
-            "is truncated"
-            if cut
-            else "is not a PyTorch zip file (saved before version 1.6, or damaged)"
-        )
+        what = "is not a PyTorch zip file (saved before version 1.6, or damaged)"
+        what = "is truncated" if cut else what
         raise UserError(f"{file} {what}: download it again, or save it as safetensors.") from None
     with archive:
-        pickles = [
-            name
-            for name in archive.namelist()
-            if name.endswith("/data.pkl") and name.count("/") == 1
-        ]
+        names = archive.namelist()
+        pickles = [name for name in names if name.endswith("/data.pkl") and name.count("/") == 1]
         if len(pickles) != 1:
             raise UserError(f"{file} is a zip file, but no PyTorch checkpoint: it has no data.pkl.")
         root = pickles[0].removesuffix("data.pkl")
         places = {i.filename.removeprefix(root + "data/"): i for i in archive.infolist()}
         order = f"{root}byteorder"
-        if order in archive.namelist() and archive.read(order) != b"little":
+        if order in names and archive.read(order) != b"little":
             raise UserError(
                 f"{file} was written on a big-endian machine: save it again on a usual one."
             )
@@ -374,6 +368,10 @@ class _Unpickler(pickle.Unpickler):
             ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
             ("torch", "Size"): lambda sizes=(): tuple(sizes),
         }
+        if module in ("torch", "torch.storage") and (kind := _OTHER_KINDS.fullmatch(name)):
+            raise UserError(
+                f"{self.file} has tensors of type {kind[1] or kind[2]}, which cannot be read: save them as float32, bfloat16 or float16."
+            )
         if (module, name) not in known:
             raise UserError(
                 f"{self.file} tries to execute code: it asks for '{module}.{name}', which no weights need; "
@@ -405,7 +403,7 @@ class _Unpickler(pickle.Unpickler):
             )
         with self.file.open(
             "rb"
-        ) as f:  # the bytes begin after the local header, whose length the index does not tell
+        ) as f:  # bytes begin after the local header: the index lacks its length
             f.seek(info.header_offset)
             local = f.read(30)
         if local[:4] != b"PK\x03\x04":
