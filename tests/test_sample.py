@@ -496,6 +496,7 @@ BAD = {
     "unknown way to chain": (["--long", "chained"], "did you mean 'chain'?"),
     "unknown option": (["--trajectry", "orbit"], "did you mean '--trajectory'?"),
     "size that does not fit": (["--size", "30x48"], "must be multiples of 16"),
+    "size beyond any memory": (["--size", "4096x4112"], "at most 16777216 pixels"),
     "size that is none": (["--size", "large"], "'large' is not HEIGHTxWIDTH"),
     "impossible field of view": (["--fov", "180"], "between 0 and 180"),
     "start that is no photo": (["--start", "4"], "start=4 is no context view"),
