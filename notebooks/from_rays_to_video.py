@@ -71,13 +71,13 @@ print("scene tokens", tokens.shape, "ray features", features.shape)
 # %% [markdown]
 # ## Condition and generate
 # `prepare` does the two steps above once more together with the photos' latents; `generate` integrates
-# $\mathrm{d}x/\mathrm{d}\sigma = V(x, \sigma; C)$ from noise to latents.
+# $\mathrm{d}x/\mathrm{d}\sigma = V(x, \sigma; C)$ from noise to latents, by the sampler that the model's configuration names.
 
 # %%
 prepared = jax.jit(functools.partial(rj.model.prepare, config=config))(params, views, scene_tokens=tokens)
 noise = rj.model.draw_noise(jax.random.key(0), len(contexts), config=config)
-grid = flow.schedule("shift", 8, shift=config.flow.shift)
-sample = jax.jit(functools.partial(rj.model.generate, config=config, solver=solvers.tabulate("euler", grid)))
+grid = flow.schedule(config.flow.schedule, config.flow.steps, shift=config.flow.shift)
+sample = jax.jit(functools.partial(rj.model.generate, config=config, solver=solvers.tabulate(config.flow.solver, grid)))
 latents, info = sample(params, prepared, noise)
 solvers.raise_if_failed(info)
 decode = jax.jit(functools.partial(rj.model.decode_video, config=config))

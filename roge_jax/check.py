@@ -12,13 +12,12 @@ import json
 import sys
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from roge_jax.data.matching import pose_agreement
-from roge_jax.data.scene import Scene, open_scene
+from roge_jax.data.scene import Scene, is_nerfstudio, open_scene
 from roge_jax.entry import execute, number, one_of
 from roge_jax.errors import UserError
 from roge_jax.folders import plain
@@ -27,10 +26,8 @@ from roge_jax.geometry.cameras import (
     Cameras,
     field_of_view,
     inspect,
-    invert,
     normalise,
-    opencv_to_opengl,
-    to_opencv,
+    other_conventions,
 )
 from roge_jax.geometry.crops import cover_window
 from roge_jax.geometry.trajectories import focus_distance
@@ -189,12 +186,9 @@ def _about_agreement(
     scene: Scene, cameras: Cameras, config: Config
 ) -> tuple[dict[str, Any], list[Finding]]:
     """Whether matched features fit the poses, and if not, whether another convention would."""
-    now = config.convention or ("opengl" if _is_nerfstudio(scene) else "opencv")
-    raw = opencv_to_opengl(cameras.c2w) if now.startswith("opengl") else cameras.c2w
-    raw = invert(raw) if now.endswith("_w2c") else raw
-    others = [convention for convention in CONVENTIONS if convention != now]
-    candidates = {now: cameras}
-    candidates |= {c: Cameras(cameras.K, to_opencv(raw, c)) for c in others}
+    now = config.convention or ("opengl" if is_nerfstudio(scene.source) else "opencv")
+    others = other_conventions(cameras, now)
+    candidates = {now: cameras} | others
     try:
         distances, pairs = pose_agreement(scene.images, candidates)
     except ImportError:
@@ -213,11 +207,6 @@ def _about_agreement(
         return numbers, [Finding("error", "poses", what, fix)]
     fix = "check intrinsics, picture order and poses (moving things also do this)"
     return numbers, [Finding("warning", "poses", what, fix)]
-
-
-def _is_nerfstudio(scene: Scene) -> bool:
-    source = Path(scene.source)
-    return source.suffix == ".json" or (source / "transforms.json").is_file()
 
 
 def render(report: Report) -> str:

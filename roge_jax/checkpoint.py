@@ -208,7 +208,9 @@ def find_model(name: str | Path) -> Path:
             f"No trained weights of preset '{name}' are here: convert the official ones with "
             f"`python -m roge_jax.convert`, or set {WEIGHTS_VARIABLE} to a folder that has '{name}/config.json'."
         )
-    raise UserError(f"Unknown checkpoint '{name}': {did_you_mean(str(name), known)}")
+    raise UserError(
+        f"Unknown checkpoint '{name}', neither a model folder nor a name: {did_you_mean(str(name), known)}"
+    )
 
 
 def load_model(
@@ -270,7 +272,9 @@ def placed(tree: Tree, dtype: Callable[[str], Any], shardings: Tree | None = Non
     """The leaves of `tree` in `dtype(path)` on their devices, one after the other from wherever they lie."""
     where = {} if shardings is None else flatten(shardings)
     flat = flatten(tree)
-    return unflatten({path: _placed(x, dtype(path), where.get(path)) for path, x in flat.items()})
+    return unflatten(
+        {path: _placed(path, x, dtype(path), where.get(path)) for path, x in flat.items()}
+    )
 
 
 def _check_memory(
@@ -294,15 +298,26 @@ def _check_memory(
         memory.refuse(name, needed, memory.HOST, memory.memory_available(), "weights", cure)
 
 
-def _placed(leaf: Any, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
-    """A copy of a leaf on its devices. Conversion is NumPy's: JAX would compile one for every shape."""
+def _placed(path: str, leaf: Any, dtype: Any, sharding: jax.sharding.Sharding | None) -> jax.Array:
+    """A copy of a leaf on its devices. Conversion is NumPy's: JAX would compile one for every shape.
+
+    Raises: UserError naming file and leaf if a number that is read is NaN or infinite.
+    """
+    from .weights.shards import finite
+
     value, wanted = np.asarray(leaf), _kind(leaf, dtype)
     shares: dict[str, np.ndarray] = {}  # devices that repeat one another read the same copy
 
     def share(index) -> np.ndarray:
         key = str(index)
         if key not in shares:  # a copy, because the file may change while the array lives
-            shares[key] = np.array(value[index], wanted)
+            share = np.array(value[index], wanted)
+            if jnp.issubdtype(wanted, jnp.floating) and not finite(share):
+                raise UserError(
+                    f"{getattr(leaf, 'file', 'the model')}: '{path}' has NaN or infinite numbers in {wanted}: "
+                    "copy or make the file again."
+                )
+            shares[key] = share
         return shares[key]
 
     if sharding is None:

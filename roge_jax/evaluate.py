@@ -241,6 +241,27 @@ def samples(
             yield take(context, target)
 
 
+def check_scenes(args: argparse.Namespace, names: list[str]) -> None:
+    """All that can be said of the scenes before hours are spent on others; procedural ones are right by construction."""
+    import warnings
+
+    from .data.scene import load_scene, procedural_seed
+
+    for name in names:
+        if name.startswith("procedural:"):
+            procedural_seed(name)
+            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # said when its turn comes
+            views = len(load_scene(name, convention=args.convention))
+        if views <= args.context:
+            raise UserError(
+                f"{name}: {views} views cannot give --context {args.context} and a target: use at most {views - 1}."
+                if views > 1
+                else f"{name}: has one view, which leaves none to compare with: give a scene of two or more."
+            )
+
+
 def methods_of(
     evaluator: Evaluator, scene: dict[str, Any], size: tuple[int, int]
 ) -> dict[str, np.ndarray]:
@@ -267,6 +288,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         raise UserError(f"--scenes names '{min(twice)}' twice: give every scene once.")
     if args.sweep and not args.sweep[0] <= args.sweep[1]:
         raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
+    check_scenes(args, names)
     evaluator = Evaluator(
         args.checkpoint, args.solver or "", args.steps or 0, args.seed, args.schedule or ""
     )

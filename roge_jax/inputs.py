@@ -10,6 +10,7 @@ from .errors import UserError
 from .fields import is_file
 
 SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
+MOST_PIXELS = 2**24  # of a picture
 RENDERED = 32  # views of a procedural scene
 THROUGH = "interpolate:order=shortest"  # the path of several photos
 ALONE = "orbit:degrees=12"  # and of one
@@ -35,6 +36,11 @@ def model_config(args: argparse.Namespace, *, weights: bool):
         raise UserError(
             f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}."
         ) from None
+    if height > 0 and width > 0 and height * width > MOST_PIXELS:
+        raise UserError(
+            f"--size {args.size}: give at most {MOST_PIXELS} pixels, e.g. 4096x4096; this model was made for "
+            f"{config.height}x{config.width}."
+        )
     patch = config.renderer.patch
     ratio = config.recon_height / config.height, config.recon_width / config.width
     return dataclasses.replace(

@@ -187,9 +187,9 @@ def main(args: argparse.Namespace) -> None:
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
             params, _ = load_weights(args, mesh)
-        beside = Beside(scene, photos.ids, config)
+        beside = Beside(scene, photos.ids, config, args.convention)
         print(
-            f"{len(photos.ids)} photos of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
+            f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
         )
         plan = None
         if args.tolerance is not None or args.max_cost is not None:

@@ -6,7 +6,8 @@
 Here the chosen photos are matched with others of the scene (`data.matching.photo_matches`, at no more than 640 pixels):
 how many pixels of the model's picture features lie from where the poses put them, and whether other focal lengths would
 fit better. Of JPEG files the quality is read. What cannot be matched says nothing. `python -m roge_jax.sample` does this
-in a thread (`Beside`) while it compiles. docs/robustness.md says how the limits were measured.
+in a thread (`Beside`) while it compiles, and refuses poses of a `transforms.json` that are plainly in other axes than they
+are read in. docs/robustness.md says how the limits were measured.
 """
 
 import sys
@@ -23,19 +24,28 @@ from .config import RoGeConfig
 from .data import matching
 from .data.images import Photos, jpeg_quality
 from .data.perturb import scale_focal
-from .data.scene import Scene
-from .errors import LimitWarning
-from .geometry.cameras import Cameras, crop_resize_K
+from .data.scene import Scene, is_nerfstudio
+from .errors import LimitWarning, UserError
+from .geometry.cameras import Cameras, crop_resize_K, other_conventions
 from .geometry.crops import cover_window
 from .limits import Beyond, entry
 
 Stage = Callable[[str], AbstractContextManager]
 
+AXES_GAIN = 3.0  # other axes fit if features lie that many times nearer to where they put them
+
 
 def beyond(
-    scene: Scene, ids: Sequence[int], config: RoGeConfig, rows: dict[str, Any] | None = None
+    scene: Scene,
+    ids: Sequence[int],
+    config: RoGeConfig,
+    rows: dict[str, Any] | None = None,
+    convention: str | None = None,
 ) -> list[Beyond]:
-    """What lies beyond the limits `rows` (of `limits.table`; the model's own if None) in the photos `ids` of a scene."""
+    """What lies beyond the limits `rows` (of `limits.table`; the model's own if None) in the photos `ids` of a scene.
+
+    convention: the one that a `transforms.json` was read with, OpenGL if None.
+    """
     rows = limits.table(config.name) if rows is None else rows
     found = []
     if "poses" in rows:
@@ -43,8 +53,46 @@ def beyond(
         matches = matching.photo_matches(scene.images, scene.cameras, ids, *size)
         pairs = zip(scene.cameras.K, scene.sizes, strict=True)
         K = np.stack([crop_resize_K(k, photo, size) for k, photo in pairs])
-        found += about_cameras(matches, Cameras(K, scene.cameras.c2w), ids, scene, size, rows)
+        cameras = Cameras(K, scene.cameras.c2w)
+        if matches and is_nerfstudio(scene.source):
+            read_as = convention or "opengl"
+            found += about_axes(matches, cameras, ids, scene, size, rows["poses"], read_as)
+        found = found or about_cameras(matches, cameras, ids, scene, size, rows)
     return found + (about_files(scene, ids, config, rows["jpeg"]) if "jpeg" in rows else [])
+
+
+def about_axes(
+    matches: matching.Matches,
+    cameras: Cameras,
+    ids: Sequence[int],
+    scene: Scene,
+    size: tuple[int, int],
+    row: dict[str, Any],
+    convention: str,
+) -> list[Beyond]:
+    """Axes of another convention than `convention`, if poses read as it are beyond the limit and read otherwise within
+    it, by a factor of `AXES_GAIN`; [] or one entry. Arguments as of `about_cameras`.
+    """
+
+    def worst(cameras: Cameras) -> float:
+        return float(
+            np.nanmax(matching.photo_misfits(matching.misfits(matches, cameras), ids), initial=0)
+        )
+
+    now = worst(cameras)
+    if now <= row["limit"]:
+        return []
+    candidates = other_conventions(cameras, convention)
+    left = {name: worst(candidate) for name, candidate in candidates.items()}
+    best = min(left, key=lambda name: left[name])
+    if left[best] > min(row["limit"], now / AXES_GAIN):
+        return []
+    message = (
+        f"{scene.source}: its poses are not '{convention}': read so, matched features lie {now:.2g} pixels of "
+        f"{size[0]}x{size[1]} from where they should, read as '{best}' {left[best]:.2g}: give --convention {best} "
+        f"(or --convention {convention} to keep them)."
+    )
+    return [Beyond("axes", now, float(row["limit"]), message)]
 
 
 def about_cameras(
@@ -125,18 +173,31 @@ def warn(scene: Scene, ids: Sequence[int], config: RoGeConfig) -> tuple[Beyond, 
 
 
 class Beside:
-    """`beyond` in a thread beside other work, for programs: `tell` waits for it and warns."""
+    """`beyond` in a thread beside other work, for programs: `tell` waits for it and warns.
 
-    def __init__(self, scene: Scene, ids: Sequence[int], config: RoGeConfig):
+    convention: the axes that the user gave; if None, poses that are plainly in others are refused.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        ids: Sequence[int],
+        config: RoGeConfig,
+        convention: str | None = None,
+    ):
         pool = ThreadPoolExecutor(1)
-        self.job = pool.submit(beyond, scene, ids, config)
+        self.job = pool.submit(beyond, scene, ids, config, convention=convention)
         pool.shutdown(wait=False)
         self.told = False
+        self.insisted = convention is not None
 
     def tell(self) -> tuple[Beyond, ...]:
         """What was found, each also a `LimitWarning` the first time; a check that failed is one that says so."""
         error = self.job.exception()
         found = () if error else tuple(self.job.result())
+        for one in found:
+            if one.kind == "axes" and not self.insisted:
+                raise UserError(one.message)
         said = [one.message for one in found]
         if error:
             said.append(f"poses and photos were not compared ({type(error).__name__}: {error})")

@@ -5,6 +5,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from scene_files import nerfstudio, truth
 
 from roge_jax import entry, evaluate
 from roge_jax.checkpoint import save_model
@@ -60,6 +61,9 @@ def test_convention_reaches_the_reader(monkeypatch, tmp_path):
         words = [*words, "--scenes", "kitchen", "--out", str(tmp_path / "r.json")]
         assert entry.execute(evaluate.main, evaluate.parser(), words) == 2
         assert asked.pop() == expected
+    with pytest.raises(UserError):
+        evaluate.open_views("kitchen", 3, (16, 16), None, "opengl_w2c")
+    assert asked.pop() == "opengl_w2c"
 
 
 def test_contexts_are_spread_and_targets_are_the_rest():
@@ -110,6 +114,12 @@ def test_neighbours_are_near_in_place_and_direction():
         (["--sweep", "nan", "5"], "'nan' is not a number"),
         (["--sweep", "50", "10"], "give LOW, then HIGH"),
         (["--scenes", "a", "a"], "--scenes names 'a' twice"),
+        (
+            ["--scenes", "motorcycle", "procedural:x", "--context", "1"],
+            "the seed must be a whole number",
+        ),
+        (["--scenes", "motorcycle"], "motorcycle: 2 views cannot give --context 3 and a target"),
+        (["--scenes", "{}/good", "{}/broken", "--context", "1"], "/broken: view 1 "),
         (["--out", "{}"], "it is a folder"),
         (["--out", "{}/file/x.json"], "cannot be written"),
         (["--sheet", "x.txt"], "ends in .png"),
@@ -118,6 +128,9 @@ def test_neighbours_are_near_in_place_and_direction():
 def test_mistakes_are_found_before_the_model_is_read(words, said, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(evaluate, "Evaluator", lambda *_: pytest.fail("must not run"))
     (tmp_path / "file").write_text("")
+    nerfstudio(tmp_path / "good", truth())
+    nowhere = np.full((4, 4), np.nan).tolist()
+    nerfstudio(tmp_path / "broken", truth(), change={1: {"transform_matrix": nowhere}})
     words = ["--out", f"{tmp_path}/r.json", *(word.format(tmp_path) for word in words)]
     assert entry.execute(evaluate.main, evaluate.parser(), words) == 2
     assert said in capsys.readouterr().err

@@ -4,6 +4,7 @@ import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scene_files import nerfstudio, truth
@@ -517,6 +518,7 @@ BAD = {
     "unknown way to chain": (["--long", "chained"], "did you mean 'chain'?"),
     "unknown option": (["--trajectry", "orbit"], "did you mean '--trajectory'?"),
     "size that does not fit": (["--size", "30x48"], "must be multiples of 16"),
+    "size beyond any memory": (["--size", "4096x4112"], "at most 16777216 pixels"),
     "size that is none": (["--size", "large"], "'large' is not HEIGHTxWIDTH"),
     "impossible field of view": (["--fov", "180"], "between 0 and 180"),
     "start that is no photo": (["--start", "4"], "start=4 is no context view"),
@@ -805,15 +807,27 @@ def test_a_network_that_breaks_stops_with_the_step_and_leaves_nothing(
     place, weights, capsys, tmp_path
 ):
     broken = jax.tree.map(np.asarray, weights)
-    broken["dit"]["head"]["linear"]["bias"] = np.full_like(
-        broken["dit"]["head"]["linear"]["bias"], np.nan
-    )
-    checkpoint.save_model(tmp_path / "nan", broken, CONFIG, dtype=np.float32)
-    code = program(place, "--checkpoint", tmp_path / "nan", "--frames", 3, out="bad")
+    linear = broken["dit"]["head"]["linear"]
+    linear["kernel"] = np.full_like(linear["kernel"], 3e38)  # finite, its products are not
+    checkpoint.save_model(tmp_path / "huge", broken, CONFIG, dtype=np.float32)
+    code = program(place, "--checkpoint", tmp_path / "huge", "--frames", 3, out="bad")
     shown = capsys.readouterr().err
     assert (
         code == 1 and "error: The velocity (the network's output) is not finite at step 0" in shown
     )
+    assert not (place / "bad").exists() and not (place / "bad.part").exists()
+
+
+@pytest.mark.parametrize("value", [np.nan, -np.inf])
+@pytest.mark.parametrize("dtype", [np.float32, jnp.bfloat16])
+def test_weights_that_are_not_finite_are_named(place, weights, capsys, tmp_path, value, dtype):
+    """Also where no noise level would show them: in the VAE's decoder."""
+    broken = jax.tree.map(lambda x: np.array(x), weights)
+    broken["vae"]["decoder"]["conv_out"]["bias"][1] = value
+    checkpoint.save_model(tmp_path / "bad", broken, CONFIG, dtype=dtype)
+    assert program(place, "--checkpoint", tmp_path / "bad", "--frames", 3, out="bad") == 2
+    shown = capsys.readouterr().err
+    assert "model-00001-of-00001.safetensors: 'vae/decoder/conv_out/bias' has NaN" in shown
     assert not (place / "bad").exists() and not (place / "bad.part").exists()
 
 

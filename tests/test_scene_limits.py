@@ -1,4 +1,4 @@
-"""Wrong poses, wrong focal lengths and JPEG are seen in the photos of a scene, said once, and never stop a run."""
+"""Wrong poses, wrong focal lengths and JPEG are seen in the photos of a scene, said once, and do not stop a run; other axes do."""
 
 import dataclasses
 import importlib
@@ -281,10 +281,11 @@ def program(weights, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(programs, "for_window", without_network)
     monkeypatch.setattr(limits, "table", lambda name: ROWS if name == "tiny" else {})
 
-    def run(folder):
-        words = ["--checkpoint", weights, "--scene", folder, "--steps", 1]
+    def run(folder, *more):
+        words = ["--checkpoint", weights, "--scene", folder, "--steps", 1, *more]
         words += ["--frames", 3, "--context", "1,2,3", "--out", tmp_path / "out"]
-        assert entry.execute(sample.main, sample.parser(), [str(w) for w in words]) == 0
+        if code := entry.execute(sample.main, sample.parser(), [str(w) for w in words]):
+            return code, capsys.readouterr().err
         record = json.loads((tmp_path / "out" / "run.json").read_text())
         assert record["stages"]["match"]["seconds"] >= 0
         said = [x for x in capsys.readouterr().err.splitlines() if x.startswith("warning: ")]
@@ -300,6 +301,43 @@ def test_the_program_says_once_that_a_focal_length_is_wrong(tmp_path, program, s
     record, said = program(bad)
     assert [one["kind"] for one in record] == ["focal"]
     assert said == [f"warning: {record[0]['message']}"] and str(bad) in said[0]
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opencv_w2c", "opengl_w2c"])
+def test_the_program_refuses_other_axes_and_names_them(tmp_path, program, scene, axes):
+    bad = write(tmp_path / "bad", scene, scene.cameras)
+    file = bad / "transforms.json"
+    content = json.loads(file.read_text())
+    for frame in content["frames"]:
+        c2w = np.array(frame["transform_matrix"])
+        c2w = c2w @ np.diag([1.0, -1.0, -1.0, 1.0]) if axes.startswith("opencv") else c2w
+        frame["transform_matrix"] = (np.linalg.inv(c2w) if "w2c" in axes else c2w).tolist()
+    file.write_text(json.dumps(content))
+    code, said = program(bad)
+    assert code == 2
+    assert f"error: {bad}: its poses are not 'opengl'" in said
+    assert f"give --convention {axes} (or --convention opengl to keep them)" in said
+    assert not list(tmp_path.glob("out*"))
+    assert program(bad, "--convention", axes) == ([], [])
+    record, said = program(bad, "--convention", "opengl")  # insists
+    assert [one["kind"] for one in record] == ["axes"] and "its poses are not 'opengl'" in said[-1]
+
+
+def test_poses_that_other_axes_explain_no_better_are_not_called_so(scene, matches):
+    """A turned camera is a wrong pose, under any axes; and poses within the limit are right."""
+    turned = scene.cameras.c2w.copy()
+    turned[2, :3, :3] = turned[2, :3, :3] @ cv2.Rodrigues(np.radians([2.0, 3.0, 0.0]))[0]
+
+    def about(c2w):
+        cameras = small(Cameras(scene.cameras.K, c2w))
+        return scene_limits.about_axes(
+            matches, cameras, [1, 2, 3], scene, SIZE, ROWS["poses"], "opengl"
+        )
+
+    assert about(turned) == about(scene.cameras.c2w) == []
+    assert judged(scene, matches, Cameras(scene.cameras.K, turned))[0].kind == "poses"
+    mixed = opencv_to_opengl(scene.cameras.c2w)
+    assert [one.kind for one in about(mixed)] == ["axes"]
 
 
 def test_a_check_that_fails_is_said_and_the_run_goes_on(tmp_path, program, scene, monkeypatch):

@@ -54,3 +54,23 @@ def test_the_reconstruction_is_ahead_of_the_plane(close):
             samples.append(take(context, target[::4]))
     above, sharpness = gains(samples)
     assert above > (1.2 if close else 2.5) and sharpness > 0.5
+
+
+def test_the_generated_video_is_near_the_reconstructions_picture():
+    """As the program samples: within a dB of it against the truth, and no greyer."""
+    evaluator = evaluate.Evaluator("mini")
+    size = (evaluator.config.height, evaluator.config.width)
+    _, take = evaluate.open_views("procedural:1000000011", 20, size, None)
+    scene = take(*evaluate.spread(20, 3, evaluator.config.frames))
+    made, truth = evaluator.videos(scene), scene["rgb"][3:]
+    generated, head = (
+        image_metrics(np.clip(made[name], 0.0, 1.0), truth) for name in ("generated", "rgb_head")
+    )
+    assert generated["psnr"] > head["psnr"] - 1.0
+    assert generated["sharpness_ratio"] > 0.9 * head["sharpness_ratio"]
+
+
+def test_the_shipped_files_are_small():
+    files = list(checkpoint.find_model("mini").glob("*.safetensors"))
+    sizes = [file.stat().st_size for file in files]
+    assert files and sum(sizes) <= 64e6 and max(sizes) <= 16e6

@@ -54,9 +54,9 @@ def test_a_step_begins_with_what_the_stage_trains_and_reads(
     placed, seen = Counter(), []
     place, before = checkpoint._placed, {id(x) for x in jax.live_arrays()}
 
-    def spied_place(leaf, *rest):
+    def spied_place(path, leaf, *rest):
         placed[leaf] += 1
-        return place(leaf, *rest)
+        return place(path, leaf, *rest)
 
     def spied_train(*arguments, **more):
         seen.append(sum(x.nbytes for x in jax.live_arrays() if id(x) not in before))

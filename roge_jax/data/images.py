@@ -17,6 +17,7 @@ from roge_jax.errors import UserError
 from roge_jax.geometry.crops import shift_K
 
 HDR = (".exr", ".hdr", ".pfm")
+MEND = "copy or export the photo again, or leave it out of the scene"
 EXIF_ORIENTATION = 0x0112
 # EXIF orientation -> quarter turns counter-clockwise from the stored to the displayed picture.
 QUARTER_TURNS = {1: 0, 3: 2, 6: 3, 8: 1}
@@ -90,7 +91,7 @@ def read_header(file: Path) -> Header:
             f"{file}: has more than {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels: make it smaller."
         ) from None
     except Exception as error:
-        raise UserError(f"{file}: not a readable picture ({error}).") from None
+        raise UserError(f"{file}: not a readable picture ({error}): {MEND}.") from None
     return Header(size, orientation if 1 <= orientation <= 8 else 1, alpha, mode)
 
 
@@ -141,7 +142,7 @@ def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.
     except UserError:
         raise
     except Exception as error:
-        raise UserError(f"{file}: damaged or truncated picture ({error}).") from None
+        raise UserError(f"{file}: damaged or truncated picture ({error}): {MEND}.") from None
     pixels = _upright(pixels, header.orientation) if exif else pixels
     if pixels.shape[-1] == 4:
         alpha = pixels[..., 3:]
@@ -177,7 +178,7 @@ def _read_deep(file: Path) -> np.ndarray:
         raise UserError(f"{file}: needs OpenCV to be read: pip install opencv-python.") from None
     pixels = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise UserError(f"{file}: damaged or truncated picture.")
+        raise UserError(f"{file}: damaged or truncated picture: {MEND}.")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise UserError(f"{file}: {pixels.dtype} pixels: convert it to an 8 or 16 bit PNG first.")
     white = np.float32(255 if pixels.dtype == np.uint8 else 65535)

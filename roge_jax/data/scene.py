@@ -85,7 +85,10 @@ def load_scene(spec: str | Path, **options: Any) -> Scene:
         if note.severity == "warning":
             warnings.warn(str(note), CameraWarning, stacklevel=2)
     heights, widths = zip(*scene.sizes, strict=True)
-    cameras = validate(scene.cameras, heights, widths, scene.names)
+    try:
+        cameras = validate(scene.cameras, heights, widths, scene.names)
+    except UserError as error:
+        raise UserError(f"{scene.source}: {error}") from None
     return dataclasses.replace(scene, cameras=cameras)
 
 
@@ -125,6 +128,12 @@ def open_scene(
         raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
     found = read_frames(Path(spec), convention=convention, camera=camera)
     return _assemble(found, name, exif, background)
+
+
+def is_nerfstudio(source: str) -> bool:
+    """Whether a scene was read from a `transforms.json`, the only layout whose axes have to be believed."""
+    path = Path(source)
+    return path.suffix == ".json" or (path / "transforms.json").is_file()
 
 
 def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:

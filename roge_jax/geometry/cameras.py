@@ -168,6 +168,14 @@ def to_opencv(poses: np.ndarray, convention: str) -> np.ndarray:
     return opengl_to_opencv(poses) if convention.startswith("opengl") else poses
 
 
+def other_conventions(cameras: "Cameras", convention: str) -> "dict[str, Cameras]":
+    """{convention: cameras} of the same written poses, had they been read as each convention but `convention`."""
+    written = opencv_to_opengl(cameras.c2w) if convention.startswith("opengl") else cameras.c2w
+    written = np.linalg.inv(written) if convention.endswith("_w2c") else written
+    others = (other for other in CONVENTIONS if other != convention)
+    return {other: Cameras(cameras.K, to_opencv(written, other)) for other in others}
+
+
 def rotation(quaternion_xyzw: np.ndarray) -> np.ndarray:
     """Rotation matrices [..., 3, 3] of quaternions [..., 4] (scalar last, any length but zero)."""
     x, y, z, w = np.moveaxis(

@@ -129,7 +129,7 @@ class Shards:
                 # First cast in the order of the source, then transpose: both copies are of one block alone.
                 block = value[i : i + rows].astype(place.dtype, order="K", copy=False)
                 block = _contiguous(block)
-                if not _finite(block):
+                if not finite(block):
                     raise FloatingPointError(path)
                 _write_all(file, block.reshape(-1).view(np.uint8))
         except OSError as error:
@@ -158,7 +158,8 @@ def _contiguous(x: np.ndarray) -> np.ndarray:
     return y
 
 
-def _finite(x: np.ndarray) -> bool:
+def finite(x: np.ndarray) -> bool:
+    """Whether no number is NaN or infinite."""
     if x.dtype.itemsize == 2 and x.dtype != np.float16:  # bfloat16, whose own test is slow
         return not x.size or bool((x.view(np.uint16) & 0x7F80).max() < 0x7F80)
     return bool(np.isfinite(x).all())
