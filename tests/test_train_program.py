@@ -13,7 +13,7 @@ from train_runs import losses, run, write_pool
 
 from roge_jax import config, entry, model, train
 from roge_jax.checkpoint import load_model, model_fingerprint, save_model
-from roge_jax.core.params import flatten
+from roge_jax.core.params import flatten, unflatten
 from roge_jax.data.source import open_source
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
@@ -226,6 +226,20 @@ def test_the_preset_must_be_that_of_the_model(tmp_path):
         run("tiny", "--init", "mini", "--devices", 1, "--out", tmp_path)
     with pytest.raises(UserError, match="'mini' model and the preset is 'tiny'"):
         run("tiny", "--init", "mini", "--dry-run")
+
+
+@pytest.mark.parametrize("path", ["dit/head/linear/kernel", "vae/decoder/conv_out/bias"])
+def test_a_start_that_is_not_finite_is_refused_before_it_trains(tmp_path, path, capsys):
+    """Whether its leaf trains or not."""
+    cfg = config.preset("tiny")
+    flat = flatten(jax.tree.map(np.array, model.init(jax.random.key(0), cfg)))
+    flat[path][...] = np.inf
+    save_model(tmp_path / "model", unflatten(flat), cfg)
+    words = ["tiny", "--init", tmp_path / "model", "--stage", "joint", "--devices", 1]
+    words = [str(word) for word in [*words, "--out", tmp_path / "out"]]
+    assert entry.execute(train.main, train.parser(), words) == 2
+    assert f"'{path}' has NaN or infinite numbers" in capsys.readouterr().err
+    assert not list((tmp_path / "out" / "joint").glob("*/*"))  # neither checkpoint nor model
 
 
 # What a run is held to when it goes on.

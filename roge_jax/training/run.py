@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from .. import checkpoint, model
 from ..config import RoGeConfig
 from ..core import distributed, sharding
 from ..core.lora import attach
-from ..core.params import Tree, count, flatten, loaded, unflatten
+from ..core.params import Tree, count, flatten, unflatten
 from ..core.params import init as init_specs
 from ..cost import kept_as
 from . import loop, stages, start
@@ -126,7 +127,7 @@ def _divided(params: Tree, stage: Stage, config, seed: int, mesh, dtype: str) ->
     trainable, frozen = model.split(params, stage.trains)
     specs, frozen_specs = stages.stage_specs(config, stage)
     with start.on_host():
-        trainable = loaded(trainable)
+        trainable = checkpoint.placed(trainable, lambda path: np.float32)
         if stage.lora:
             added = stages.new_leaves(config, stage)
             trainable = attach(trainable, init_specs(jax.random.key(seed + 1), added))
