@@ -35,7 +35,7 @@ from roge_jax.geometry.validation import Finding, axes_votes
 from roge_jax.metrics.geometry import straightness
 
 BAD_FIT = (
-    3.0  # pixels of median epipolar distance: good poses reach 0.1 to 1, wrong axes 20 and more
+    3.0  # pixels of median epipolar distance: good poses have 0.1 to 1, wrong axes 20 and more
 )
 
 

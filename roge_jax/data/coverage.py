@@ -17,9 +17,7 @@ from .scene import Scene, cameras_at
 
 FRAMES, GRID = 9, (4, 7)  # target views and rays of each that are looked at
 DEPTHS = (0.5, 0.8, 1.25, 2.0, 4.0)  # in distances in focus
-FALL = np.radians(
-    25.0
-)  # angle between two rays to a point at which one stands in for the other 1/e as well
+FALL = np.radians(25.0)  # between two rays to a point: one then stands in for the other 1/e as well
 NOTHING = 1e-9  # a photo that adds less is not worth its place
 
 

@@ -25,9 +25,7 @@ LONG_SIDE = 640  # matching happens on pictures of at most this size
 PARTNERS = 2  # views that each photo is matched with
 LEAST = 1.0  # times the model's size: smaller photos are not matched for it, nothing was measured
 SLACK = 1.1  # a focal length fits as well as the best one if distances are at most this much larger
-FACTORS = np.exp(
-    0.7 * np.linspace(-1.0, 1.0, 101) ** 3
-)  # of focal lengths, 0.5 to 2, dense around 1
+FACTORS = np.exp(0.7 * np.linspace(-1.0, 1.0, 101) ** 3)  # of focal lengths: 0.5 to 2, dense at 1
 
 Pair = tuple[int, int]
 Matches = dict[Pair, tuple[np.ndarray, np.ndarray]]  # pixels [p, 2] in the one and the other view

@@ -18,9 +18,7 @@ from roge_jax.errors import UserError
 CAP_DB = 100.0  # identical images have infinite PSNR; means need a number
 WINDOW, SIGMA = 11, 1.5  # Wang et al. 2004
 LUMA = (0.299, 0.587, 0.114)  # Rec. 601
-QUANTISATION = (
-    1.0 / 255.0
-) ** 2 / 12.0  # energy of 8-bit rounding: below it, detail is not measurable
+QUANTISATION = (1.0 / 255.0) ** 2 / 12.0  # energy of 8-bit rounding: no detail is measured below it
 GMSD_C = 170.0 / 255.0**2  # Xue et al. 2014, moved from [0, 255] to [0, 1]
 
 Array = Any  # np.ndarray or jax.Array; the result is of the same kind as the input

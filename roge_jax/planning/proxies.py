@@ -25,7 +25,7 @@ from ..windows import window_views
 
 PROBE_STEPS = 2  # and twice as many
 LEFT_OUT = (
-    2  # photos, spread evenly over the order given: more say little more and cost as much again
+    2  # photos, evenly spread over the order given: more say little more and cost as much again
 )
 
 
