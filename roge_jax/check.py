@@ -34,9 +34,7 @@ from roge_jax.geometry.trajectories import focus_distance
 from roge_jax.geometry.validation import Finding, axes_votes
 from roge_jax.metrics.geometry import straightness
 
-BAD_FIT = (
-    3.0  # pixels of median epipolar distance: good poses have 0.1 to 1, wrong axes 20 and more
-)
+BAD_FIT = 3.0  # pixels of median epipolar distance: good poses 0.1 to 1, wrong axes 20 and more
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,7 @@ import numpy as np
 # nearest rotation (0.5 degrees of ray error at most), above it the matrix is something else and
 # guessing would hide a mistake.
 ACCEPT, PROJECT = 1e-5, 1e-2
-FOCAL_RANGE = (
-    0.05,
-    50.0,
-)  # focal length / image width: fields of view from 168 down to 1.1 degrees
+FOCAL_RANGE = (0.05, 50.0)  # focal length / image width: views of 168 down to 1.1 degrees
 FARTHEST = 1e100  # squares of positions must not overflow
 WIDE_FOV = 120.0  # degrees
 

@@ -24,9 +24,7 @@ from ..video import flow, solvers
 from ..windows import window_views
 
 PROBE_STEPS = 2  # and twice as many
-LEFT_OUT = (
-    2  # photos, evenly spread over the order given: more say little more and cost as much again
-)
+LEFT_OUT = 2  # photos, evenly spread: more say little more and cost as much again
 
 
 @dataclasses.dataclass(frozen=True)
