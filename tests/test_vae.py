@@ -215,6 +215,16 @@ def test_map_is_one_to_one_with_the_published_keys(names):
     assert mapping.source_shapes(entries, specs) == listing
 
 
+def test_both_names_of_a_tensor_lead_to_the_same_leaf():
+    """Most layers have a sibling of their shape: only the listing tells which names belong together."""
+    pairs = {row["official key"]: row["diffusers key"] for row in key_listing("wan21_vae")}
+    official, diffusers = (
+        wan_vae.mapping(VAEConfig(), names) for names in ("official", "diffusers")
+    )
+    for entry, other in zip(official, diffusers, strict=True):
+        assert (entry.path, pairs[entry.keys[0]]) == (other.path, other.keys[0])
+
+
 @pytest.mark.parametrize("names", ["official", "diffusers"])
 def test_export_and_import_are_inverse(small, names):
     params = small[0]

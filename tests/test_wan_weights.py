@@ -51,6 +51,22 @@ def test_every_released_tensor_fills_one_leaf(listing, cfg, count, names):
     assert wan_dit.naming(want) == names
 
 
+@pytest.mark.parametrize(("listing", "cfg"), [row[:2] for row in RELEASED])
+def test_both_names_of_a_tensor_lead_to_the_same_leaf(listing, cfg):
+    """Queries and keys, say, have one shape: only the listing tells which of their names belong together."""
+    ours, theirs = (
+        [
+            (e.path, i, key)
+            for e in wan_dit.dit_entries(cfg, names=names)
+            for i, key in enumerate(e.keys)
+        ]
+        for names in ("official", "diffusers")
+    )
+    pairs = {row["official key"]: row["diffusers key"] for row in key_listing(listing)}
+    assert len(pairs) == len(set(pairs.values())) == len(ours)
+    assert [(path, i, pairs[key]) for path, i, key in ours] == theirs
+
+
 def test_counts_of_the_presets_and_of_their_lora():
     paper, wan = preset("paper").dit, preset("wan1.3b").dit
     assert paper == I2V
