@@ -226,8 +226,12 @@ def framecrafter(cfg, seed=7, rank=2):
     }
 
 
-def test_framecrafter_is_merged_into_the_transformer(files, tmp_path):
+@pytest.mark.parametrize("dtype", [np.float32, BF16], ids=["float32", "bfloat16"])
+def test_framecrafter_is_merged_into_the_transformer(files, tmp_path, dtype):
+    """Products of the factors are float32, whatever the file is in: only the factors themselves are rounded."""
     lora, tensors = framecrafter(CONFIG.dit)
+    tensors = {key: value.astype(dtype) for key, value in tensors.items()}
+    lora = {path: value.astype(dtype).astype(np.float32) for path, value in lora.items()}
     made.save(tmp_path / "fc.safetensors", tensors)
     run(
         *everything(files),
@@ -245,7 +249,7 @@ def test_framecrafter_is_merged_into_the_transformer(files, tmp_path):
     np.testing.assert_array_equal(
         got["dit/blocks/self_attn/k/kernel"], tree["blocks/self_attn/k/kernel"]
     )
-    whole = wan_dit.PATCH.to_ours(tensors["patch_embedding.weight"])
+    whole = wan_dit.PATCH.to_ours(tensors["patch_embedding.weight"]).astype(np.float32)
     np.testing.assert_array_equal(got["dit/patch_embed/kernel"], whole[:, :, :36])
     np.testing.assert_array_equal(got["dit/patch_embed/bias"], 1)
     # One photo, repeated four times in its slot, is embedded as by FrameCrafter.
@@ -530,6 +534,22 @@ def test_missing_shard_and_truncated_file(files, tmp_path):
     fails("00002-of-00003.safetensors has 12 bytes behind its last tensor", "--wan", folder)
     made.save(second, {"patch_embedding.weight": np.ones(2, np.float32)})
     fails(r"00002-of-00003.safetensors lacks tensor", "--wan", folder)
+
+
+def test_a_tensor_in_two_shards_is_that_of_the_index(tmp_path):
+    """A shard of another version beside the right one: the index says which of the two files has the tensor."""
+    for first in (True, False):
+        folder = made.save_sharded(tmp_path / str(first), made.dit_tensors()[1])
+        index = json.loads((folder / "diffusion_pytorch_model.safetensors.index.json").read_text())
+        files = sorted(set(index["weight_map"].values()))
+        right, wrong = (files[0], files[-1]) if first else (files[-1], files[0])
+        key = next(key for key, file in index["weight_map"].items() if file == right)
+        other = sources.open_source(folder / wrong)
+        tensors = {k: np.array(other.read(k)) for k in other.tensors}
+        made.save(folder / wrong, tensors | {key: np.full((2, 2), 7, np.float32)})
+        found = sources.open_source(folder)
+        assert found.tensors[key].file.name == right
+        assert found.tensors.keys() == index["weight_map"].keys()
 
 
 def test_all_mismatches_are_in_one_error(files, tmp_path):

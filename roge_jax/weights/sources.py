@@ -286,7 +286,8 @@ def _indexed(index: Path) -> dict[str, Stored]:
             raise UserError(
                 f"{index.parent / name} lacks tensor '{absent[0]}', which {index.name} says it holds."
             )
-        tensors |= shard
+        # Of a tensor in several shards the index says which; one that it does not list is somebody's mistake to report.
+        tensors |= {key: place for key, place in shard.items() if files.get(key, name) == name}
     return tensors
 
 
