@@ -362,10 +362,13 @@ def test_pytorch_files(files, tmp_path):
         sources.open_source(cut)
 
 
-def pytorch_zip(file: Path, content: bytes) -> Path:
+def pytorch_zip(file: Path, content: bytes, storage: bytes = bytes(64)) -> Path:
+    """As PyTorch writes it: storages begin at multiples of 64 bytes, padded in their local headers."""
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("archive/data.pkl", content)
-        archive.writestr("archive/data/0", bytes(64))
+        info = zipfile.ZipInfo("archive/data/0")
+        info.extra = b"FB" + (20).to_bytes(2, "little") + b"Z" * 20
+        archive.writestr(info, storage)
     return file
 
 
@@ -394,26 +397,44 @@ def test_pytorch_reads_the_files_that_these_tests_write(tmp_path):
         np.testing.assert_array_equal(state[key].numpy(), value, err_msg=key)
 
 
-def tensor_pickle(shape: str, strides: str, start=0) -> bytes:
-    """A PyTorch pickle of {"w": tensor of float32 storage 0 with 16 elements}, written opcode by opcode."""
-    storage = b"(Vstorage\nctorch\nFloatStorage\nV0\nVcpu\nI16\ntQ"
-    arguments = b"(" + storage + f"I{start}\n{shape}{strides}".encode() + b"I00\n}t"
-    return b"}Vw\nctorch._utils\n_rebuild_tensor_v2\n" + arguments + b"Rs."
+def tensor_pickle(shape: str, strides: str, start=0, kind="Float", count=16, typed="") -> bytes:
+    """A PyTorch pickle of {"w": tensor of storage 0}, written opcode by opcode; `typed`: of a kind younger than typed
+    storages, whose storage counts bytes."""
+    storage = f"(Vstorage\nctorch\n{kind}Storage\nV0\nVcpu\nI{count}\ntQ".encode()
+    arguments = b"(" + storage + f"I{start}\n{shape}{strides}".encode() + b"I00\n}"
+    arguments += f"ctorch\n{typed}\n".encode() if typed else b""
+    rebuild = "_rebuild_tensor_v3" if typed else "_rebuild_tensor_v2"
+    return f"}}Vw\nctorch._utils\n{rebuild}\n".encode() + arguments + b"tRs."
 
 
-def test_pytorch_pickle_by_hand(tmp_path):
-    file = pytorch_zip(tmp_path / "a.pt", tensor_pickle("(I2\nI3\nt", "(I1\nI2\nt", 1))
-    source = sources.open_source(file)
-    assert source.shapes == {"w": (2, 3)} and source.read("w").shape == (2, 3)
+KINDS = [  # name of the storage, the tensor's own if it is another, elements of 64 bytes as the storage counts them
+    ("Double", "", np.float64, 8),
+    ("Float", "", np.float32, 16),
+    ("BFloat16", "", BF16, 32),
+    ("Half", "", np.float16, 32),
+    ("Untyped", "uint16", np.uint16, 64),
+]
+
+
+@pytest.mark.parametrize(("kind", "typed", "dtype", "count"), KINDS)
+def test_pytorch_pickle_by_hand(tmp_path, kind, typed, dtype, count):
+    """Values begin behind the padding, at an element of the tensor's own size, and none lies outside."""
+    n = 64 // np.dtype(dtype).itemsize
+    values = np.arange(n).astype(dtype)
+    more = {"kind": kind, "typed": typed, "count": count}
+    content = tensor_pickle("(I2\nI3\nt", "(I1\nI2\nt", 1, **more)
+    source = sources.open_source(pytorch_zip(tmp_path / "a.pt", content, values.tobytes()))
+    found = source.read("w")
+    assert source.shapes == {"w": (2, 3)} and found.dtype == dtype
+    np.testing.assert_array_equal(found, values[1:7].reshape(3, 2).T)
     for shape, strides, start in (
-        ("(I2\nI9\nt", "(I9\nI1\nt", 0),
-        ("(I4\nt", "(I1\nt", 13),
-        ("(I4\nt", "(I-1\nt", 8),
+        ("(I2\nI9\nt", "(I9\nI1\nt", n - 17),
+        ("(I4\nt", "(I1\nt", n - 3),
+        ("(I4\nt", "(I-1\nt", n - 4),
     ):
         with pytest.raises(UserError, match="reaches outside its storage"):
-            sources.open_source(
-                pytorch_zip(tmp_path / "b.pt", tensor_pickle(shape, strides, start))
-            )
+            content = tensor_pickle(shape, strides, start, **more)
+            sources.open_source(pytorch_zip(tmp_path / "b.pt", content, values.tobytes()))
 
 
 @pytest.mark.parametrize(
@@ -449,6 +470,36 @@ def test_other_kinds_of_numbers_are_no_attack(tmp_path, name):
     file = pytorch_zip(tmp_path / "model.pt", f"ctorch\n{name}\n.".encode())
     with pytest.raises(UserError, match=f"tensors of type {name.removesuffix('Storage')}, which"):
         sources.open_source(file)
+
+
+# ---- writing -------------------------------------------------------------------------------------
+
+
+def test_large_leaves_are_written_in_blocks_and_tiles(tmp_path, monkeypatch):
+    """Layers in any order, transposed as the published matrices are, and none of the sizes divides another."""
+    monkeypatch.setattr(shards, "BLOCK_BYTES", 1000)
+    monkeypatch.setattr(shards, "TILE", 8)
+    rng = np.random.default_rng(0)
+    leaves = {
+        "a/kernel": rng.standard_normal((3, 50, 37), np.float32).astype(BF16),
+        "b/kernel": rng.standard_normal((41, 29), np.float32),
+        "c/scale": rng.standard_normal(900, np.float32),
+    }
+    layout = shards.plan_shards({p: (x.shape, x.dtype) for p, x in leaves.items()}, 7000)
+    files = shards.Shards(tmp_path, layout)
+    for layer in (2, 0, 1):
+        files.write("a/kernel", np.asfortranarray(leaves["a/kernel"][layer]), layer)
+    files.write("b/kernel", np.asfortranarray(leaves["b/kernel"]))
+    files.write("c/scale", leaves["c/scale"])
+    bad = leaves["c/scale"].copy()
+    bad[-1] = np.nan
+    with pytest.raises(FloatingPointError):
+        files.write("c/scale", bad)
+    files.close()
+    assert len(layout.sizes) > 1
+    got = stored(tmp_path)
+    for path, value in leaves.items():
+        np.testing.assert_array_equal(got[path], value, err_msg=path)
 
 
 # ---- bad input -----------------------------------------------------------------------------------
@@ -733,6 +784,62 @@ def test_a_killed_conversion_resumes_to_the_same_files(files, tmp_path, monkeypa
         assert (tmp_path / "m" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), (
             name
         )
+
+
+def test_what_a_note_says_is_done_is_on_the_disk(files, tmp_path, monkeypatch):
+    """Or a loss of power leaves holes in a file that a resumed conversion takes for written."""
+    plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in everything(files)]))
+    monkeypatch.setattr(importer, "FLUSH_BYTES", 300_000)
+    order: list[str] = []
+
+    def noted(name, call):
+        def spy(*arguments, **more):
+            order.append(name)
+            return call(*arguments, **more)
+
+        return spy
+
+    monkeypatch.setattr(os, "fsync", noted("sync", os.fsync))
+    monkeypatch.setattr(shards.Shards, "write", noted("write", shards.Shards.write))
+    monkeypatch.setattr(os, "replace", noted("note", os.replace))
+    importer.write(plan, tmp_path / "m", shard_bytes=500_000)
+    files_of_it = len(plan.layout(500_000).sizes)
+    notes = [i for i, what in enumerate(order) if what == "note"][:-1]  # the last names the folder
+    assert len(notes) > 2 and files_of_it > 1
+    for i in notes:
+        assert order[i - files_of_it : i] == ["sync"] * files_of_it, order[:i]
+
+
+def test_a_conversion_is_resumed_with_the_same_files_and_options_alone(files, tmp_path):
+    """Also where all sizes are the same: half of one prompt, seed or file and half of another make no model."""
+    plan, _ = convert.make_plan(parse(convert.parser(), [str(a) for a in everything(files)]))
+
+    def interrupt(done, total):
+        if done > total / 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        importer.write(plan, tmp_path / "m", progress=interrupt)
+    other = dataclasses.replace(CONFIG, flow=dataclasses.replace(CONFIG.flow, photometric=0.5))
+    swapped = [plan.fills[0]._replace(key=plan.fills[1].key), *plan.fills[1:]]
+    for name, changed in (
+        ("seed", plan._replace(seed=1)),
+        ("given", plan._replace(given={p: x + 1 for p, x in plan.given.items()})),
+        ("dtype", plan._replace(half=False)),
+        ("config", plan._replace(config=other)),
+        ("pieces", plan._replace(fills=swapped)),
+    ):
+        with pytest.raises(UserError, match=f"was begun with another '{name}'"):
+            importer.write(changed, tmp_path / "m", resume=True)
+    file = plan.fills[-1].source.files[0]
+    times = file.stat().st_atime_ns, file.stat().st_mtime_ns
+    try:
+        os.utime(file, ns=(times[0], times[1] + 1_000_000))  # written again, of the same size
+        with pytest.raises(UserError, match="was begun with another 'files'"):
+            importer.write(plan, tmp_path / "m", resume=True)
+    finally:
+        os.utime(file, ns=times)
+    importer.write(plan, tmp_path / "m", resume=True)
 
 
 def test_an_interrupt_keeps_what_is_done(files, tmp_path):
