@@ -94,7 +94,8 @@ def test_adapter_there_and_back(adapter, tmp_path):
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 def test_merged_model_stands_alone(base, adapter, tmp_path, dtype):
-    checkpoint.save_model(tmp_path / "base", base, SMALL, dtype=dtype)
+    origin = {"converted": [{"option": "--vggt", "tensors": 3}]}
+    checkpoint.save_model(tmp_path / "base", base, SMALL, dtype=dtype, provenance=origin)
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL, PROVENANCE)
     run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "m", "--shard-gb", 1e-3)
     got, config = checkpoint.load_model(tmp_path / "m", dtype=None)
@@ -122,6 +123,7 @@ def test_merged_model_stands_alone(base, adapter, tmp_path, dtype):
     assert changed.max() > 0.05  # the comparison is not of two unmerged models
     provenance = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
     assert provenance["merged"]["steps"] == 20
+    assert provenance["base"] == origin  # whose licence holds on, whatever the adapter recorded
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
@@ -186,9 +188,11 @@ def test_what_does_not_fit_is_named(base, adapter, tmp_path):
         run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "m")
     lone = params.flatten(adapter)
     del lone["dit/blocks/ffn/fc1/lora_b"]
+    lone["dit/blocks/ffn/fc2/lora_a"] = lone["dit/blocks/ffn/fc2/lora_a"][..., :1]  # of rank 3 in b
     lone["dit/blocks/unknown/bias"] = np.ones(3)
     with pytest.raises(
-        UserError, match=r"2 mismatches\): dit/blocks/ffn/fc1/lora_a .* dit/blocks/unknown/bias"
+        UserError,
+        match=r"4 mismatches\): dit/blocks/ffn/fc1/lora_a .*fc2/lora_a .*fc2/lora_b .* dit/blocks/unknown/bias",
     ):
         checkpoint.save_adapter(tmp_path / "b", params.unflatten(lone), SMALL)
     content = (tmp_path / "a" / "adapter.safetensors").read_bytes()

@@ -13,7 +13,7 @@ from test_sharding import drawn, small
 
 from roge_jax import checkpoint, cost, entry, model, sample, sampling
 from roge_jax.checkpoint import find_model, load_config, load_model, save_model
-from roge_jax.core import memory, sharding
+from roge_jax.core import memory, params, sharding
 from roge_jax.core.params import abstract, flatten
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
@@ -47,9 +47,9 @@ def test_sampling_on_a_mesh_equals_one_device(saved):
 
     def run(mesh):
         where = None if mesh is None else sharding.shardings(model.specs(cfg), mesh)
-        params, _ = load_model(folder, shardings=where)
+        weights, _ = load_model(folder, shardings=where)
         with sharding.use(mesh):
-            result = sampling.sample(params, cfg, photos, path, settings)
+            result = sampling.sample(weights, cfg, photos, path, settings)
         return result.frames, result.preview
 
     one = run(None)
@@ -66,16 +66,22 @@ class TestLoading:
         where = flatten(sharding.shardings(specs, mesh))
         whole, _ = load_model(folder)
         shared, _ = load_model(folder, shardings=sharding.shardings(specs, mesh))
+        written = flatten(drawn(specs, 1))
         assert any(not s.is_fully_replicated for s in where.values())
         for name, x in flatten(shared).items():
             assert x.sharding == where[name], name
-            np.testing.assert_array_equal(np.asarray(x), flatten(whole)[name])
+            np.testing.assert_array_equal(np.asarray(x), written[name], err_msg=name)
+            np.testing.assert_array_equal(flatten(whole)[name], written[name], err_msg=name)
 
     def test_types(self, saved):
-        folder, _ = saved
+        folder, cfg = saved
         half, _ = load_model(folder, dtype=lambda p: "float32" if "norm" in p else "bfloat16")
+        written = flatten(drawn(model.specs(cfg), 1))
         for name, x in flatten(half).items():
             assert x.dtype == (jnp.float32 if "norm" in name else jnp.bfloat16), name
+            np.testing.assert_array_equal(
+                np.asarray(x), written[name].astype(x.dtype), err_msg=name
+            )
         assert {x.dtype for x in jax.tree.leaves(load_model(folder, dtype=None)[0])} == {
             np.dtype(np.float32)
         }
@@ -86,10 +92,10 @@ class TestLoading:
         where = sharding.shardings(model.specs(config), mesh)
         sizes = [4 * x.size for x in jax.tree.leaves(abstract(model.specs(config)))]
         tracemalloc.start()
-        params, _ = load_model("mini", shardings=where)
+        loaded, _ = load_model("mini", shardings=where)
         kept, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
-        assert len(jax.tree.leaves(params)) == len(sizes)
+        assert len(jax.tree.leaves(loaded)) == len(sizes)
         assert peak - kept < max(sizes) + 2e6 < sum(sizes) / 4
 
     def test_weights_that_memory_does_not_hold_are_refused_before_one_is_read(
@@ -104,8 +110,11 @@ class TestLoading:
         assert share < 0.9 * whole
         read = []
         monkeypatch.setattr(checkpoint, "_placed", lambda *_: read.append(1))
+        half = {"dtype": lambda path: "bfloat16" if path.startswith("dit/") else "float32"}
+        saved_by_half = 2.0 * params.count(specs["dit"])
         # A host holds all of them once, a device with memory of its own its share.
         for name, least, given, cure in (
+            ("memory_available", whole - saved_by_half, half, "close other programs"),
             ("memory_available", whole, {}, "close other programs"),
             ("memory_available", whole, {"shardings": where}, "close other programs"),
             ("own_memory", whole, {}, "fsdp=N"),

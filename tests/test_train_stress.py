@@ -270,23 +270,31 @@ def test_a_bad_row_on_one_device_is_skipped_on_all():
                     np.testing.assert_array_equal(shard.data, old)
 
 
-def test_a_damaged_checkpoint_is_named_and_the_one_before_it_continues(tmp_path):
-    """One flipped bit in the largest file; deleting what the message names resumes from the checkpoint before."""
+def flip(file):
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+
+
+@pytest.mark.parametrize("damage", [flip, Path.unlink], ids=["one flipped bit", "one lost file"])
+def test_a_damaged_checkpoint_is_named_and_the_one_before_it_continues(tmp_path, damage):
+    """The largest file; deleting what the message names resumes from the checkpoint before."""
     run(tmp_path, 20)
     last = tmp_path / "checkpoints" / "20"
     assert (last / CHECKSUMS).exists()
     victim = max(
         (p for p in (last / "default").rglob("*") if p.is_file()), key=lambda p: p.stat().st_size
     )
-    data = bytearray(victim.read_bytes())
-    data[len(data) // 2] ^= 1
-    victim.write_bytes(data)
+    damage(victim)
     with pytest.raises(
         UserError, match=rf"step 20 .* is damaged: .*{victim.name} .*continue from step 10"
     ):
         run(tmp_path, 25, resume=True)
     shutil.rmtree(last)
     assert int(run(tmp_path, 25, resume=True)["step"]) == 25
+    (tmp_path / "checkpoints" / "25" / CHECKSUMS).write_text("{")  # cut off on its way
+    with pytest.raises(UserError, match=rf"step 25 .* is damaged: {CHECKSUMS} is not what"):
+        run(tmp_path, 26, resume=True)
     (tmp_path / "checkpoints" / "25" / CHECKSUMS).unlink()  # killed before they were written
     run(tmp_path, 26, resume=True)
 
