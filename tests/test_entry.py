@@ -3,6 +3,7 @@
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 
@@ -10,7 +11,14 @@ import pytest
 
 from roge_jax import entry
 from roge_jax.errors import UserError
-from roge_jax.folders import keep_settings, output_file, output_folder, write_json
+from roge_jax.folders import (
+    check_disk,
+    keep_settings,
+    output_file,
+    output_folder,
+    put,
+    write_json,
+)
 
 
 def program(main, *arguments):
@@ -197,6 +205,33 @@ class TestOutputFolder:
         with output_folder(out) as folder:
             (folder / "new").write_text("")
         assert self.left(tmp_path) == ["out", "out/new"]
+
+    def test_an_earlier_run_is_there_until_the_new_one_has_its_name(self, tmp_path, monkeypatch):
+        old, new = tmp_path / "out", tmp_path / "out.part"
+        for folder in (old, new):
+            folder.mkdir()
+            (folder / "run.json").write_text(folder.name)
+
+        def lost(*_):
+            raise KeyboardInterrupt  # or the power goes
+
+        monkeypatch.setattr(type(new), "replace", lost)
+        with pytest.raises(KeyboardInterrupt):
+            put(new, old)
+        assert {file.read_text() for file in tmp_path.rglob("run.json")} == {"out", "out.part"}
+
+    def test_the_room_that_a_run_has_taken_is_not_asked_for_again(self, tmp_path, monkeypatch):
+        with (tmp_path / "shard").open("wb") as file:
+            file.write(bytes(1_000_000))
+            file.flush()
+            os.fsync(file.fileno())
+        taken, usage = 512 * (tmp_path / "shard").stat().st_blocks, shutil.disk_usage(tmp_path)
+        assert taken >= 1_000_000
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+        check_disk(taken + 1000, tmp_path / "new" / "folder", held=[tmp_path])
+        for needed, held in ((taken + 1001, [tmp_path]), (taken + 1000, [])):
+            with pytest.raises(UserError, match="make room or give another --out"):
+                check_disk(needed, tmp_path / "new", held=held)
 
     def test_two_runs_do_not_share_a_folder(self, tmp_path):
         with output_folder(tmp_path / "out") as folder:
