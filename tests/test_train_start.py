@@ -64,6 +64,15 @@ def test_an_adapter_of_free_weights_is_free():
         record = {"base": start, "base_provenance": provenance(start)}
         assert "license: apache-2.0" in adapter_card({}, SMALL, record)
     assert "license: other" in adapter_card({}, SMALL, {"base": "somewhere"})
+    for options, kind in (
+        (["--wan", "--wan-vae"], "apache-2.0"),
+        (["--wan", "--lagernvs"], "other"),
+        (["--vggt"], "other"),
+        (["--wan", "--framecrafter"], "other"),
+        (["--wan", "--of-a-newer-version"], "other"),
+    ):
+        record = {"converted": [{"option": option, "tensors": 1} for option in options]}
+        assert f"license: {kind}" in adapter_card({}, SMALL, {"base_provenance": record}), options
 
 
 # What is refused before a weight is loaded, or a file written.
