@@ -12,6 +12,7 @@ ADAPTER is a folder that `checkpoint.save_adapter` wrote. Merging streams: memor
 import argparse
 import functools
 import json
+import shutil
 from pathlib import Path
 
 from .entry import number, one_of
@@ -186,7 +187,8 @@ def write_lora(tree, config, style: str, out: Path) -> None:
         raise UserError("The adapter holds no LoRA of the transformer: only --merge can export it.")
     tensors = export_lora(unflatten(flat), style=style)  # type: ignore[arg-type]
     part = check_output(out)
-    part.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(part, ignore_errors=True)  # of an export that was killed
+    part.mkdir(parents=True)
     save_file(tensors, part / FILES[style], metadata={"format": "pt"})
     share(part / FILES[style])
     rank = next(x.shape[-1] for p, x in flat.items() if p.endswith("lora_a"))

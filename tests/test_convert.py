@@ -574,6 +574,12 @@ def test_missing_shard_and_truncated_file(files, tmp_path):
     fails("diffusion_pytorch_model-00002-of-00003.safetensors missing", "--wan", folder)
     (folder / "diffusion_pytorch_model.safetensors.index.json").rename(tmp_path / "index")
     fails("shard 2 of 3 is missing", "--wan", folder)
+    for other in ("other-00002-of-00003", "diffusion_pytorch_model-00002-of-00002"):
+        made.save(folder / f"{other}.safetensors", {"a": np.ones(2, np.float32)})
+        fails("holds more than one checkpoint", "--wan", folder)
+        (folder / f"{other}.safetensors").unlink()
+    made.save(tmp_path / "one/best-of-luck.safetensors", {"a": np.ones(2, np.float32)})
+    assert sources.open_source(tmp_path / "one").shapes == {"a": (2,)}
     (tmp_path / "index").rename(folder / "diffusion_pytorch_model.safetensors.index.json")
     second.write_bytes(content[:-10])
     fails(r"00002-of-00003\.safetensors is truncated: .* tensor '.*' is cut off", "--wan", folder)

@@ -175,6 +175,10 @@ class TestLaunchArguments:
                 "index below it",
             ),
             ({"MASTER_ADDR": "a", "WORLD_SIZE": "2", "RANK": "0"}, "MASTER_PORT"),
+            (
+                {"MASTER_ADDR": "a:1", "WORLD_SIZE": "2", "RANK": "0", "LOCAL_WORLD_SIZE": "2"},
+                "LOCAL_RANK is no number",
+            ),
         ],
     )
     def test_mistakes(self, given, named):

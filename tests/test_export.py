@@ -147,7 +147,11 @@ def test_lora_of_the_transformer_for_other_programs(adapter, tmp_path, style, ca
     from safetensors.numpy import load_file
 
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL)
+    (tmp_path / "out.part").mkdir()
+    (tmp_path / "out.part/model-00001-of-00009.safetensors").write_bytes(b"of one that was killed")
     run(tmp_path / "a", "--style", style, "--out", tmp_path / "out")
+    names = {export.FILES[style]} | ({"adapter_config.json"} if style == "peft" else set())
+    assert {file.name for file in (tmp_path / "out").iterdir()} == names
     tensors = load_file(tmp_path / "out" / export.FILES[style])
     back, rest = lora_export.import_lora(tensors, SMALL.dit)
     assert not rest

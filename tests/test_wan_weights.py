@@ -160,7 +160,7 @@ def test_lora_files_of_others():
     tree, rest = lora_export.import_lora(tensors, TINY)
     assert rest.keys() == {"patch_embedding.weight"}
     for block in range(TINY.depth):  # alpha / rank = 2 on one layer, which is missing from block 0
-        tensors[f"blocks.{block}.ffn.0.alpha"] = np.float32(8.0)
+        tensors[f"blocks.{block}.ffn.0.alpha"] = np.full((1,) * block, 8.0, np.float32)
     for side in "AB":
         del tensors[f"blocks.0.ffn.0.lora_{side}.default.weight"]
     scaled, _ = lora_export.import_lora(tensors, TINY)

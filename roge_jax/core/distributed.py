@@ -63,7 +63,10 @@ def launch_arguments(environment: Mapping[str, str]) -> dict[str, Any] | None:
             "process_id": int(index),
         }
         if names[0] == "MASTER_ADDR" and environment.get("LOCAL_WORLD_SIZE", "1") != "1":
-            found["local_device_ids"] = [int(environment["LOCAL_RANK"])]  # one process per device
+            local = environment.get("LOCAL_RANK", "")
+            if not local.isdecimal():
+                raise UserError("LOCAL_WORLD_SIZE is set but LOCAL_RANK is no number: set both.")
+            found["local_device_ids"] = [int(local)]  # one process per device
         return found
     if any(int(environment.get(name, 1)) > 1 for name in _LAUNCHERS):
         return {}

@@ -249,7 +249,7 @@ def _pieces(plan: Plan) -> list[tuple[str, int | None, Callable[[], np.ndarray],
 
 def _write_pieces(plan: Plan, part: Path, layout: Layout, done: int, progress) -> None:
     shards = Shards(part, layout, fresh=not done)
-    written = pending = 0
+    written = pending = i = 0
     total = sum(layout.sizes)
     try:
         for i, (path, layer, value, origin) in enumerate(_pieces(plan)):

@@ -67,7 +67,7 @@ def import_lora(
         if match := re.search(_FACTOR, bare):
             factors.setdefault(bare[: match.start()], {})[_SIDE[match[1]]] = np.asarray(value)
         elif bare.endswith(".alpha"):
-            alphas[bare.removesuffix(".alpha")] = float(np.asarray(value))
+            alphas[bare.removesuffix(".alpha")] = float(np.asarray(value).reshape(()))
         else:
             rest[bare] = value
 

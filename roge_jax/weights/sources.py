@@ -227,9 +227,9 @@ def _folder(folder: Path) -> dict[str, Stored]:
     if len(indexes) == 1:
         return _indexed(indexes[0])
     files = sorted(folder.glob("*.safetensors"))
-    shards = {f: parts for f in files if (parts := f.stem.rpartition("-of-"))[1]}
-    if files and not indexes and len(shards) == len(files):
-        return _shards(folder, files, int(next(iter(shards.values()))[2]))
+    kinds = {re.sub(r"-\d+-of-(\d+)$", r"/\1", f.stem) for f in files}
+    if len(kinds) == 1 and not indexes and "/" in (kind := kinds.pop()):
+        return _shards(folder, files, int(kind.rpartition("/")[2]))
     if len(indexes) > 1 or len(files) > 1:
         names = ", ".join(f.name for f in indexes or files)
         raise UserError(
