@@ -17,6 +17,7 @@ from roge_jax.core.lora import attach
 from roge_jax.core.params import Spec, abstract, count, flatten, unflatten
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
+from roge_jax.recon import ray_scene
 from roge_jax.training.loop import initial_state
 from roge_jax.training.optim import OptimConfig, make_optimiser
 from roge_jax.video import dit
@@ -303,6 +304,28 @@ class TestActivations:
             "heads divide: all-to-all; otherwise keys are gathered"
         )
         assert by_heads or "all-gather" in program.as_text()
+
+
+    @pytest.mark.parametrize("attention", ["bidirectional", "cross"])
+    def test_devices_share_the_views_of_a_scene(self, attention):
+        """Four views on four devices: each queries the rays of about one, and all get what one device gets."""
+        cfg = dataclasses.replace(
+            config.preset("tiny").renderer, attention=attention, relative_cameras=False, chunk=4
+        )
+        p = drawn(ray_scene.renderer_specs(cfg), 0)
+        rng = np.random.default_rng(0)
+        z = rng.normal(size=(2, 24, cfg.width)).astype(np.float32)
+        plucker = rng.normal(size=(4, 32, 48, 6)).astype(np.float32)
+        programs, found = [], []
+        for mesh in (None, sharding.make_mesh(seq=4, devices=jax.devices()[:4])):
+            query = functools.partial(ray_scene.query_rays, cfg=cfg, contexts=2)
+            with sharding.use(mesh):
+                where = {} if mesh is None else {"out_shardings": sharding.replicated(mesh)}
+                programs.append(jax.jit(query, **where).lower(p, z, plucker).compile())
+            found.append(np.asarray(programs[-1](p, z, plucker)))
+        one, four = (program.cost_analysis()["flops"] for program in programs)
+        assert four < 0.35 * one
+        np.testing.assert_allclose(found[1], found[0], rtol=1e-5, atol=1e-5)
 
 
 class TestBatches:
