@@ -99,6 +99,10 @@ def disagree(data: int, fsdp: int) -> None:
         return distributed.global_batch(views, mesh, BATCH)["views"]
 
     assert batch(3).shape == (BATCH, 3, 2)
+    # Nobody holds all scenes of a batch, and everybody gets them, in their order.
+    numbered = distributed.global_batch({"number": 10.0 * rows}, mesh, BATCH)
+    assert not numbered["number"].is_fully_addressable and len(rows) < BATCH
+    np.testing.assert_array_equal(sharding.gather(numbered)["number"], 10.0 * np.arange(BATCH))
     check = functools.partial(check_processes, version="1")
     check({"seed": 0, "devices": None}, "mini", None)
     for wrong in (

@@ -102,6 +102,7 @@ def test_lost_process(tmp_path, count, data, fsdp):
 
 
 def test_processes_that_differ_say_so_instead_of_computing(tmp_path):
+    """And of what they share each gets the whole."""
     out = tmp_path / "differ"
     assert wait(start(out, 2, 2, 1, steps="disagree"), out) == [0, 0], text(out, 2)
     for index in range(2):

@@ -305,7 +305,6 @@ class TestActivations:
         )
         assert by_heads or "all-gather" in program.as_text()
 
-
     @pytest.mark.parametrize("attention", ["bidirectional", "cross"])
     def test_devices_share_the_views_of_a_scene(self, attention):
         """Four views on four devices: each queries the rays of about one, and all get what one device gets."""
