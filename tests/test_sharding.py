@@ -305,6 +305,14 @@ class TestActivations:
         )
         assert by_heads or "all-gather" in program.as_text()
 
+    @pytest.mark.parametrize("seq", [2, 8])
+    def test_what_travels_into_attention_is_in_the_type_of_its_products(self, seq):
+        x = jax.ShapeDtypeStruct((24, 2, 8), jnp.float32)
+        with sharding.use(sharding.make_mesh(seq=seq)):
+            traced = jax.make_jaxpr(lambda x: sharding.by_heads(x, x, x, jnp.bfloat16))(x)
+        moved = [e for e in traced.eqns if e.primitive.name == "sharding_constraint"]
+        assert [str(e.invars[0].aval.dtype) for e in moved] == 3 * ["bfloat16"]
+
     @pytest.mark.parametrize("attention", ["bidirectional", "cross"])
     def test_devices_share_the_views_of_a_scene(self, attention):
         """Four views on four devices: each queries the rays of about one, and all get what one device gets."""
