@@ -199,21 +199,26 @@ class TestRoom:
             and "where 0.01 GB are free" in said
         )
         cfg = config.preset("tiny")
-        for steps, fits in ((1, True), (3, False)):  # one checkpoint is kept, or three
-            stage = dataclasses.replace(lora(cfg), steps=steps)
-            one = estimate.state_bytes(cfg, stage)
-            model_bytes = 4 * (
-                params.count(model.specs(cfg)) + params.count(stages.stage_specs(cfg, stage)[0])
-            )
-            free = model_bytes + 1.5 * one
-            monkeypatch.setattr(
-                folders.shutil, "disk_usage", lambda _, f=free: usage._replace(free=f)
-            )
-            if fits:
-                room.check_space(tmp_path, [(stage, cfg)], save_every=1)
-            else:
-                with pytest.raises(UserError, match="make room or give another --out"):
-                    room.check_space(tmp_path, [(stage, cfg)], save_every=1)
+        joint = stages.find_stage(stages.mini_stages(frames=cfg.frames), "joint")
+        for stage in (lora(cfg), joint):
+            one, found = estimate.state_bytes(cfg, stage), stages.stage_specs(cfg, stage)[0]
+            written = 4 * params.count(model.specs(cfg)) + 4 * params.count(found) * stage.lora
+            assert (one > written) == (stage is joint)
+            for times, steps, least in (
+                (1, 1, one + written),
+                (1, 3, 3 * one + written),
+                (1, 9, max(4 * one, 3 * one + written)),  # the fourth is whole before one goes
+                (2, 9, max(7 * one + written, 6 * one + 2 * written)),
+            ):
+                recipe = times * [(dataclasses.replace(stage, steps=steps), cfg)]
+                for free, fits in ((least, True), (least - 1, False)):
+                    room_left = usage._replace(free=free)
+                    monkeypatch.setattr(folders.shutil, "disk_usage", lambda _, r=room_left: r)
+                    if fits:
+                        room.check_space(tmp_path, recipe, save_every=1)
+                    else:
+                        with pytest.raises(UserError, match="make room or give another --out"):
+                            room.check_space(tmp_path, recipe, save_every=1)
 
     def test_linux_tells_its_memory(self):
         found = room.memory_available()

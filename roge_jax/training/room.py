@@ -81,15 +81,15 @@ def check_space(
     out: Path, recipe: Sequence[tuple[Stage, RoGeConfig]], *, save_every: int, keep: int = 3
 ) -> None:
     """Raise UserError unless the disk has room for checkpoints and models of every stage (beside what is there)."""
-    needed = 0.0
+    kept = most = 0.0
     for stage, config in recipe:
         specs, _ = stage_specs(config, stage)
-        kept = min(keep, -(-stage.steps // save_every))
-        needed += kept * estimate.state_bytes(config, stage) + 4.0 * count(model.specs(config))
-        needed += 4.0 * count(specs) if stage.lora else 0.0
-        needed += estimate.stored_bytes(config, stage)
+        state, saves = estimate.state_bytes(config, stage), -(-stage.steps // save_every)
+        kept += min(keep, saves) * state + estimate.stored_bytes(config, stage)
+        most = max(most, kept + state * (saves > keep))  # the oldest goes when the new one is whole
+        kept += 4.0 * count(model.specs(config)) + (4.0 * count(specs) if stage.lora else 0.0)
     what = "What the run keeps (checkpoints, models, encoded samples)"
-    check_disk(needed, out, what, held=[out / stage.name for stage, _ in recipe])
+    check_disk(max(most, kept), out, what, held=[out / stage.name for stage, _ in recipe])
 
 
 def _here(device: jax.Device) -> bool:
