@@ -75,6 +75,15 @@ def test_adding_a_leaf_changes_no_other():
         )
 
 
+def test_no_two_leaves_start_alike():
+    """Nor do those of one shape whose names are of one length."""
+    specs = {name: layers.linear_specs(8, 8, bias=False) for name in ("q", "k", "v", "o")}
+    kernels = params.flatten(params.init(jax.random.key(0), specs)).values()
+    other = params.flatten(params.init(jax.random.key(1), specs)).values()
+    drawn = np.stack([np.asarray(x).ravel() for x in (*kernels, *other)])
+    assert np.abs(np.corrcoef(drawn) - np.eye(8)).max() < 0.6  # of 64 numbers; 5 sigma
+
+
 def test_check_lists_every_mismatch_in_one_error():
     tree = params.init(jax.random.key(0), SPECS)
     del tree["embed"]["bias"]
@@ -287,6 +296,18 @@ def test_lora_adapts_exactly_the_matching_kernels():
         "blocks/mlp/fc1/lora_a": (2, 8, 2),
         "blocks/mlp/fc1/lora_b": (2, 2, 16),
     }
+    # They are split like the sides of the kernels that they stand beside.
+    assert {path: s.axes for path, s in params.flatten(specs).items()} == {
+        "conv/lora_a": (None, None),
+        "conv/lora_b": (None, "embed"),
+        "blocks/q/lora_a": ("layers", "embed", None),
+        "blocks/q/lora_b": ("layers", None, "mlp"),
+        "blocks/mlp/fc1/lora_a": ("layers", "embed", None),
+        "blocks/mlp/fc1/lora_b": ("layers", None, "mlp"),
+    }
+    wide = lora.lora_specs({"fc": layers.linear_specs(400, 4)}, 16, "fc")["fc"]["lora_a"]
+    a = np.asarray(params.init(jax.random.key(0), {"a": wide})["a"])
+    assert 0.99 / 20 < np.abs(a).max() <= 1 / 20  # uniform within 1 / sqrt(d_in), as peft has it
     assert not any(
         np.any(x) for path, x in params.flatten(factors).items() if path.endswith("lora_b")
     )

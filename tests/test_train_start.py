@@ -12,7 +12,7 @@ from train_runs import run, write_pool
 from roge_jax import checkpoint, config, convert, entry, export, folders, model, train
 from roge_jax.checkpoint import load_provenance
 from roge_jax.config import to_dict
-from roge_jax.core import params, sharding
+from roge_jax.core import memory, params, sharding
 from roge_jax.entry import parse
 from roge_jax.errors import UserError
 from roge_jax.training import estimate, room, stages
@@ -220,6 +220,20 @@ class TestRoom:
                         with pytest.raises(UserError, match="make room or give another --out"):
                             room.check_space(tmp_path, recipe, save_every=1)
 
-    def test_linux_tells_its_memory(self):
+    def test_linux_tells_its_memory(self, monkeypatch):
         found = room.memory_available()
         assert found is None or 1e7 < found < 1e14
+        said = "MemTotal:  9000 kB\nMemFree:   10 kB\nMemAvailable:   700 kB\nBuffers:   5 kB\n"
+        monkeypatch.setattr(memory.Path, "read_text", lambda file: said)
+        assert memory.memory_available() == 700 * 1024
+        monkeypatch.setattr(memory.Path, "read_text", lambda file: "nothing")
+        assert memory.memory_available() is None
+
+    def test_the_smallest_device_tells_the_memory_of_all(self):
+        def device(**stats):
+            return SimpleNamespace(memory_stats=lambda: stats or None)
+
+        busy = {"bytes_in_use": 7, "peak_bytes_in_use": 8}
+        devices = [device(bytes_limit=n, **busy) for n in (90, 60, 80)]
+        assert memory.own_memory(devices) == 60
+        assert memory.own_memory([device(), device(**busy)]) is None
