@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from roge_jax import cost, model, programs
+from roge_jax import cost, fusion, model, programs
 from roge_jax.config import preset
 from roge_jax.core.attention import SCORES_BYTES, scores_limit
 from roge_jax.core.params import abstract, count
@@ -150,6 +150,40 @@ class TestTracedPrograms:
         real = multiplied(run, p, x, array(tokens, cfg.width // cfg.heads // 2), kv)
         assert real == pytest.approx(cost.velocity(cfg, tokens), rel=1e-9)
 
+    def test_text(self, name):
+        """Embedding of text and CLIP rows, and the keys and values of all blocks: once per video."""
+        cfg = preset(name).dit
+        assert (cfg.text_len == 0) == (name == "mini")
+        if not cfg.text_len:
+            assert cost.text(cfg) == 0.0
+            return
+        p = abstract(dit.dit_specs(cfg))
+
+        def run(p, text, clip):
+            rows = dit.context_rows(p, text, clip, cfg=cfg)
+            return dit.precompute_context(p, rows, cfg=cfg)
+
+        text = array(cfg.text_len, cfg.text_dim)
+        assert multiplied(run, p, text, None) == pytest.approx(cost.text(cfg), rel=1e-9)
+        if cfg.clip_dim:
+            rows = cfg.text_len + cfg.clip_rows
+            real = multiplied(run, p, text, array(cfg.clip_rows, cfg.clip_dim))
+            assert real == pytest.approx(cost.text(cfg, rows), rel=1e-9)
+
+    def test_fusion(self, name):
+        plain, m = preset(name), 2
+        # Ray features on the grid of the latents: resizing them, by matrices, is not in the formula.
+        config = dataclasses.replace(plain, recon_height=plain.height, recon_width=plain.width)
+        views, (lh, lw) = m + config.frames, config.latent_size
+        arguments = (
+            abstract(fusion.fusion_specs(config)),
+            array(m, lh, lw, 16),
+            array(views, config.height, config.width, 6),
+            array(views, lh, lw, config.renderer.width),
+        )
+        real = multiplied(fusion.condition, *arguments)
+        assert real == pytest.approx(cost.fusion(config, views, config.slots(m)), rel=1e-9)
+
     def test_vae(self, name):
         cfg, frames, size = preset(name).vae, 9, (32, 48)
         p = abstract(vae.vae_specs(cfg))
@@ -217,6 +251,19 @@ class TestEstimate:
         assert SCORES_BYTES < 4 * 6804**2 * 40, "queries in pieces"
         assert plain - fused == SCORES_BYTES
 
+    def test_a_report_adds_up_the_windows(self):
+        """Three windows: the first sees two photos, the others four with frames that were made."""
+        config = preset("tiny")
+        first, other = cost.estimate(config, 2, 8), cost.estimate(config, 4, 8)
+        text = cost.report(config, 2, 8, frames=3 * config.frames, later=4, half=False, solver="x")
+        total = cost.scaled(first.total_flops + 2 * other.total_flops, "FLOP")
+        peak = cost.scaled(max(first.peak_bytes, other.peak_bytes), "B")
+        assert f"windows of {config.frames}: 3" in text
+        assert f"\n{'all windows':24s}{total:>16s}\n" in text and f"about {peak}: weights" in text
+        alone = cost.report(config, 2, 8, frames=config.frames, later=4, half=False, solver="x")
+        total = cost.scaled(first.total_flops, "FLOP")
+        assert f"\n{'all windows':24s}{total:>16s}\n" in alone and "photos    2\n" in alone
+
     def test_a_preview_costs_one_more_encoding_and_decoding(self):
         plain = preset("tiny")
         config = dataclasses.replace(plain, fusion=dataclasses.replace(plain.fusion, preview=True))
@@ -256,3 +303,14 @@ class TestEstimate:
                 jax.jit(function).lower(*arguments).compile().memory_analysis().temp_size_in_bytes
             )
             assert 0.5 < e.working_bytes[name] / used < 2, name
+
+    def test_reconstruction_takes_the_scores_of_all_heads(self):
+        """Three photos, whose scores are most of it, against XLA: of half the heads it would be two thirds."""
+        size = {"height": 96, "width": 160, "recon_height": 96, "recon_width": 160}
+        config, m = dataclasses.replace(preset("tiny"), frames=9, **size), 3
+        views = {"context_rgb": array(m, 96, 160, 3), "K": array(m, 3, 3), "c2w": array(m, 4, 4)}
+        views["vectors"] = array(m, 11)
+        p = abstract({"encoder": model.specs(config)["encoder"]})
+        run = jax.jit(lambda p, views: model.reconstruct(p, views, config=config))
+        used = run.lower(p, views).compile().memory_analysis().temp_size_in_bytes
+        assert 0.8 < cost.estimate(config, m, 1).working_bytes["reconstruct"] / used < 1.25

@@ -10,7 +10,7 @@ import pytest
 from test_sharding import small
 
 from roge_jax import checkpoint, config, model, train
-from roge_jax.core import program, sharding
+from roge_jax.core import params, program, sharding
 from roge_jax.core.attention import as_on_gpu, attention, is_attention
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
@@ -166,21 +166,76 @@ def test_no_scores_of_the_papers_attention_are_planned_for():
 
 
 def test_a_mesh_splits_what_its_table_says():
-    cfg = small()
-    stage = lora(cfg, batch=4)
-    one, eight = (
+    cfg = small()  # deep enough that what its blocks keep is most of the memory
+    cfg = dataclasses.replace(cfg, dit=dataclasses.replace(cfg.dit, depth=24))
+    stage = dataclasses.replace(lora(cfg), batch=4, remat="none")
+    one, four, eight = (
         estimate.estimate(cfg, stage, m=2, mesh=sharding.abstract_mesh(*sizes))
-        for sizes in ((1, 1, 1), (2, 2, 2))
+        for sizes in ((1, 1, 1), (4, 1, 1), (2, 2, 2))
     )
-    assert (one.scenes, eight.scenes) == (4, 1)
+    assert (one.scenes, four.scenes, eight.scenes) == (4, 1, 1)
     sizes = {"transformer": 8, "query rays": 8, "VAE": 4}  # `seq` repeats the VAE
     for name, ways in sizes.items():  # the embeddings of time and text are the same for all scenes
         ratio = sum(one.work[name].values()) / sum(eight.work[name].values())
         assert ratio == pytest.approx(ways, rel=0.02), name
     assert eight.memory["frozen weights"] < one.memory["frozen weights"]
+    state, activations = "trained weights and optimiser", "activations and gradients"
+    # `fsdp` halves all but one side of some factors of LoRA.
+    assert 0.5 * one.memory[state] <= eight.memory[state] < 0.6 * one.memory[state]
+    assert four.memory[state] == one.memory[state]
+    assert one.fullest == four.fullest == "transformer, forward"
+    assert (
+        eight.memory[activations] < 0.65 * four.memory[activations] < 0.4 * one.memory[activations]
+    )
     assert 3.9 < one.memory["batch"] / eight.memory["batch"] < 4.1
     with pytest.raises(UserError, match="sizes that divide it"):
         estimate.estimate(cfg, stage, m=2, mesh=sharding.abstract_mesh(3))
+
+
+def test_gradients_lie_where_their_parameters_do():
+    """In a stage that trains the whole transformer they are most of what a step holds for a while."""
+    cfg = small()
+    stage = stages.find_stage(stages.mini_stages(frames=cfg.frames), "prior")
+    stage = dataclasses.replace(stage, remat="full", batch=1)
+    one, two = (
+        estimate.estimate(cfg, stage, m=2, mesh=sharding.abstract_mesh(fsdp=n)).memory
+        for n in (1, 2)
+    )
+    gradients = 4 * params.count(stages.stage_specs(cfg, stage)[0])
+    saved = one["activations and gradients"] - two["activations and gradients"]
+    assert saved > 0.4 * gradients
+
+
+def test_what_is_computed_again_is_told_apart_and_reported():
+    cfg = config.preset("tiny")
+    work = {
+        "VAE": {"forward": 4e9, "recomputed": 0.0, "backward": 0.0},
+        "transformer": {"forward": 1e9, "recomputed": 2e9, "backward": 3e9},
+    }
+    found = estimate.Estimate(
+        tokens={"views": 7},
+        parameters={"trained": 1_000_000, "frozen": 2_000_000},
+        scenes=1,
+        work=work,
+        memory={"frozen weights": 5e9, "batch": 6e9},
+        fullest="VAE, forward",
+    )
+    text = estimate.report(found, cfg, lora(cfg), m=2, mesh=None, dtype="float32")
+    rows = {line[:30].strip(): line[30:] for line in text.splitlines()}
+    place = {name: rows["FLOPs of one device, one step"].index(name) for name in estimate.PASSES}
+    for part, passes in work.items():
+        for name, value in passes.items():
+            cell = rows[part][: place[name] + len(name)].split()[-2:]
+            assert value == 0 or cell == [f"{value / 1e9:.0f}", "G"], (part, name)
+    assert rows["frozen weights"].split() == ["5", "GB"]
+    assert [line.split() for line in text.splitlines() if line.startswith("all ")] == [
+        ["all", "10", "GFLOP"],
+        ["all", "11", "GB"],
+    ]
+    scope = "transpose(jvp(transformer))/rematted_computation/dot_general"
+    assert estimate.which_pass(scope) == "recomputed" and estimate.part(scope) == "transformer"
+    assert estimate.which_pass("transpose(jvp(rays))/dot_general") == "backward"
+    assert estimate.which_pass("jvp(rays)/dot_general") == "forward"
 
 
 def test_frozen_leaves_are_counted_in_their_own_type():

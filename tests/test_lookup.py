@@ -293,18 +293,22 @@ def test_cost():
     run = functools.partial(lookup.look_up, cuts=CUTS)
     K, c2w = (lambda n: array(n, 3, 3)), (lambda n: array(n, 4, 4))
     p = abstract(lookup.lookup_specs(D, 8, CUTS))
-    real = multiplied(
-        run,
-        p,
-        array(v, H // 8, W // 8, D),
-        array(v, H, W, 3),
-        array(m, H, W, 3),
-        (K(v), c2w(v)),
-        (K(m), c2w(m)),
-    )
     cfg = dataclasses.replace(CONFIG.renderer, width=D)
-    formula = cost.lookup(cfg, H, W, m, v)
-    assert formula <= real <= 1.03 * formula  # projections are not in the formula
+    real, formula = {}, {}
+    for photos in (m, m + 1):
+        real[photos] = multiplied(
+            run,
+            p,
+            array(v, H // 8, W // 8, D),
+            array(v, H, W, 3),
+            array(photos, H, W, 3),
+            (K(v), c2w(v)),
+            (K(photos), c2w(photos)),
+        )
+        formula[photos] = cost.lookup(cfg, H, W, photos, v)
+    assert formula[m] <= real[m] <= 1.01 * formula[m]  # projections are not in the formula
+    one = formula[m + 1] - formula[m]  # what one more photo costs
+    assert one <= real[m + 1] - real[m] <= 1.06 * one
     assert cost.lookup(TINY.renderer, H, W, m, v) == 0.0
     less, more = (cost.preview(c, 3) for c in (TINY, CONFIG))
     assert more - less == pytest.approx(cost.lookup(CONFIG.renderer, H, W, 3, TINY.frames))

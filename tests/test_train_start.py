@@ -1,5 +1,6 @@
 """What the training program looks at before it begins, and what it writes of the model that it began with."""
 
+import contextlib
 import dataclasses
 import json
 from types import SimpleNamespace
@@ -128,6 +129,18 @@ def lora(cfg):
     return stages.lora_stage(10, frames=cfg.frames)
 
 
+@pytest.mark.parametrize("objective", sorted(stages.OBJECTIVES))
+def test_a_gpu_refuses_heads_in_every_stage_that_runs_the_transformer(objective):
+    """12 heads on five devices; stages of the other networks have no tokens to split by heads."""
+    cfg, mesh = config.preset("wan1.3b"), sharding.abstract_mesh(seq=5)
+    stage = dataclasses.replace(lora(cfg), objective=objective)
+    room.check_layout(cfg, stage, mesh, fused=False)
+    transformer = objective in ("prior", "joint", "encoded")
+    refused = pytest.raises(UserError, match="seq=5 does not divide 12 attention heads")
+    with refused if transformer else contextlib.nullcontext():
+        room.check_layout(cfg, stage, mesh, fused=True)
+
+
 class TestRoom:
     """The published 14B transformer, of which nothing is loaded, against memory and disks that are made up."""
 
@@ -156,6 +169,14 @@ class TestRoom:
             else:
                 with pytest.raises(UserError, match="for weights, optimiser and gradients alone"):
                     room.check_room(lora(cfg), cfg, None, dtype="float32")
+        # Two CPU devices with copies of everything are in the same memory.
+        mesh = sharding.make_mesh(2, devices=jax.devices()[:2])
+        least = 4 * (2 * (params.count(frozen) + 4 * params.count(trained)) + params.count(trained))
+        for free, fits in ((1.001 * least, True), (0.999 * least, False)):
+            monkeypatch.setattr(room, "memory_available", lambda free=free: free)
+            with contextlib.nullcontext() if fits else pytest.raises(UserError, match="alone"):
+                said = room.check_room(lora(cfg), cfg, mesh, dtype="float32")
+                assert "estimated to take 2e+03 GB of memory" in said  # 1e12 bytes on each
         monkeypatch.setattr(room, "memory_available", lambda: 1000 * least)
         monkeypatch.setattr(estimate, "estimate", None)  # a small model starts at once
         assert room.check_room(lora(cfg), cfg, None, dtype="float32") == ""
@@ -204,6 +225,8 @@ class TestRoom:
             one, found = estimate.state_bytes(cfg, stage), stages.stage_specs(cfg, stage)[0]
             written = 4 * params.count(model.specs(cfg)) + 4 * params.count(found) * stage.lora
             assert (one > written) == (stage is joint)
+            if stage is not joint:  # AdamW: parameters, two moments, a few counters
+                assert one == pytest.approx(12 * params.count(found), rel=1e-3)
             for times, steps, least in (
                 (1, 1, one + written),
                 (1, 3, 3 * one + written),
