@@ -19,6 +19,7 @@ from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.folders import BLOCK_BYTES, BLOCKS, fingerprint
 from roge_jax.training import diagnose, loop, stages
+from roge_jax.training.start import hold_settings
 
 
 def test_joint_training_resumes_exactly_and_saves_a_model(common, tmp_path):
@@ -276,6 +277,41 @@ def test_another_start_or_pool_of_the_same_name_is_refused(common, cheap, tmp_pa
     assert "does not say with which frozen dtype, start contents, data contents" in said
     with pytest.raises(UserError, match="holds a run with seed 0, and 1 is asked for"):
         go("moved", "moved", "--steps", 2, "--resume", "--seed", 1)
+
+
+def test_every_setting_that_changes_what_is_trained_is_held(tmp_path):
+    cfg = config.preset("tiny")
+    stage = stages.lora_stage(10, frames=cfg.frames)
+    pool = write_pool(tmp_path / "pool", (32, 48))
+
+    def hold(begun=True, stage=stage, config=cfg, params=0.0, **changes):
+        given = {"seed": 0, "frozen_dtype": "float32", "start": "a", "pool": pool} | changes
+        weights = {"x": np.full(3, params, np.float32)}
+        return hold_settings(tmp_path, stage, weights, config, begun=begun, resume=True, **given)
+
+    hold(begun=False)
+    assert hold(start="of another name") == []
+    (said,) = hold(stage=dataclasses.replace(stage, steps=20))
+    assert "begun for 10 steps and continued for 20" in said
+    faster = dataclasses.replace(stage.optim, learning_rate=1e-3)
+    for name, changes in (
+        ("model", {"config": dataclasses.replace(cfg, name="other")}),
+        ("size", {"config": dataclasses.replace(cfg, height=64)}),
+        ("batch", {"stage": dataclasses.replace(stage, batch=5)}),
+        ("seed", {"seed": 1}),
+        ("learning rate", {"stage": dataclasses.replace(stage, optim=faster)}),
+        ("frozen dtype", {"frozen_dtype": "bfloat16"}),
+        ("start contents", {"params": 1.0}),
+        ("data contents", {"pool": None}),
+        ("samples encoded once", {"stage": dataclasses.replace(stage, stored=7)}),
+    ):
+        with pytest.raises(UserError, match=f"holds a run with {name} "):
+            hold(**changes)
+    colours = np.load(pool / "shard_00000.rgb.npy")
+    colours[-1, -1, -1, -1] += 1
+    np.save(pool / "shard_00000.rgb.npy", colours)
+    with pytest.raises(UserError, match="holds a run with data contents "):
+        hold()
 
 
 def test_a_fingerprint_tells_contents_and_nothing_else(tmp_path):
