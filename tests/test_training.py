@@ -141,6 +141,43 @@ def test_a_run_may_be_resumed_on_another_number_of_devices(tmp_path):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
 
 
+def test_state_and_frozen_weights_lie_in_shares_while_they_train(tmp_path):
+    """As the table says, in every step and at the end; results alone would not show copies on every device."""
+    specs = {"layer": linear_specs(16, 2)}
+    frozen_specs = {"base": linear_specs(32, 4, bias=False)}
+    mesh, seen = sharding.make_mesh(2, 4, devices=jax.devices()[:8]), []
+
+    def linear_objective(trainable, frozen, batch, key):
+        kernel = trainable["layer"]["kernel"]
+        return jnp.square(batch["x"] @ kernel[:3] - batch["y"]).mean(), {
+            "base": frozen["base"]["kernel"].sum()
+        }
+
+    def look(trainable, frozen, batch, key):
+        leaves = trainable["layer"]["kernel"], frozen["base"]["kernel"], batch["x"]
+        seen.append([leaf.sharding.shard_shape(leaf.shape) for leaf in leaves])
+        return {}
+
+    state = training.train(
+        linear_objective,
+        params.init(jax.random.key(0), specs),
+        params.init(jax.random.key(1), frozen_specs),
+        specs,
+        batch_of,
+        optim=OPTIM,
+        loop=LoopConfig(steps=2, log_every=1),
+        out=tmp_path,
+        mesh=mesh,
+        frozen_specs=frozen_specs,
+        diagnose=look,
+        diagnose_every=1,
+    )
+    assert seen == 2 * [[(4, 2), (8, 4), (1, 3)]]
+    kernels = [x for x in jax.tree.leaves(state) if x.shape == (16, 2)]
+    assert len(kernels) == 4, "parameters, their average and two moments"
+    assert {x.sharding.shard_shape(x.shape) for x in kernels} == {(4, 2)}
+
+
 # Steps that are not finite.
 
 
@@ -284,6 +321,19 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(tmp_path):
     found = {row["step"]: row["held_loss"] for row in rows if "held_loss" in row}
     assert found == {0: 1.0, 10: 1.0, 20: None}  # before the first step, too
     assert sorted(int(p.name) for p in (tmp_path / "checkpoints").iterdir()) == [10]
+
+
+def test_the_averaged_parameters_are_evaluated(tmp_path):
+    def total(p):
+        return {"held_sum": float(jnp.sum(p["layer"]["kernel"]))}
+
+    state = run(tmp_path, 10, evaluate=total, evaluate_every=5)
+    found = [row["held_sum"] for row in log_of(tmp_path) if "held_sum" in row]
+    assert len(found) == 3 and found[0] == total(start())["held_sum"]
+    assert found[-1] == total(state["ema"])["held_sum"] != total(state["params"])["held_sum"]
+    plain = dataclasses.replace(OPTIM, ema=0.0)
+    state = run(tmp_path / "plain", 10, optim=plain, evaluate=total, evaluate_every=10)
+    assert log_of(tmp_path / "plain")[-1]["held_sum"] == total(state["params"])["held_sum"]
 
 
 # Checkpoints and resuming.
