@@ -83,7 +83,7 @@ def train(
     )
 
 
-def disagree(data: int, fsdp: int) -> None:
+def disagree(out: Path, data: int, fsdp: int) -> None:
     """Print what is said where processes differ, and fail where they agree and something is said."""
     import jax
 
@@ -104,8 +104,18 @@ def disagree(data: int, fsdp: int) -> None:
     assert not numbered["number"].is_fully_addressable and len(rows) < BATCH
     np.testing.assert_array_equal(sharding.gather(numbered)["number"], 10.0 * np.arange(BATCH))
     check = functools.partial(check_processes, version="1")
-    check({"seed": 0, "devices": None}, "mini", None)
+    for name in ("shared", f"own{own}"):  # what a process sees under one name on its own disk
+        (out / name).mkdir(parents=True, exist_ok=True)
+        for file in ("config.json", "shard_00000.npz"):
+            (out / name / file).write_text(f"{file} of {name}")
+    distributed.meet("files")
+    shared, mine = out / "shared", out / f"own{own}"
+    check({"seed": 0, "devices": None, "encode_once": None}, "mini", None)
+    check({"seed": 0}, str(shared), shared)
     for wrong in (
+        lambda: check({"seed": 0}, str(mine), shared),
+        lambda: check({"seed": 0}, str(shared), mine),
+        lambda: check({"seed": 0, "encode_once": 4}, "scratch", None),
         lambda: batch(3 + own),
         lambda: check({"seed": 0, "out": f"runs/{own}"}, "scratch", None),
         lambda: check({"seed": 0, "devices": 1}, "scratch", None),
@@ -125,7 +135,7 @@ if __name__ == "__main__":
     options = sys.argv[5:]
     maybe_initialise_distributed()
     if steps == "disagree":
-        disagree(int(data), int(fsdp))
+        disagree(Path(out), int(data), int(fsdp))
     else:
         train(
             Path(out),

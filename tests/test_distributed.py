@@ -113,6 +113,9 @@ def test_processes_that_differ_say_so_instead_of_computing(tmp_path):
             "Process 1 has views float32[4, 2], and process 0 has float32[3, 2]",
             "Process 1 has --out runs/1, and process 0 has runs/0: start every process with the same",
             "--devices 1 is for one process, and 2 are running",
+            "--encode-once is for one process, and 2 are running",
+            "Process 1 has a start with contents",
+            "Process 1 has data with contents",
         ):
             assert words in said, said
 

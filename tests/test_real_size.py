@@ -1,6 +1,7 @@
 """The unattended speed run: what goes wrong in one row stays in that row, and every row of the goals is there."""
 
 import argparse
+import dataclasses
 import importlib.util
 import json
 import sys
@@ -108,11 +109,12 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
         large: there,
         "a row of the past": here,
     }
-    out, called = tmp_path / "out.json", []
+    out, called, limits = tmp_path / "out.json", [], []
     environment = {"device": {"kind": "here"}, "commit": "abc"}
 
     def child(name, side, args, limit):
         called.append((name, side))
+        limits.append(limit)
         return here | {"seconds": 1.0}
 
     monkeypatch.setattr(experiment, "child", child)
@@ -132,6 +134,18 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
     assert found[one] == here | {"peer": here | {"seconds": 1.0, "commit": "abc"}}
     assert found[three] == stored[three] and found[large] == there
     assert "a row of the past" not in found
+    others = {name: x for name, x in found.items() if name not in stored and name != unrolled}
+    assert others and all(x == {"status": "not measured"} for x in others.values())
+    assert max(limits) == 12 * 60.0
+    limits.clear()
+    run("--only", "dit", "--minutes", "2")
+    assert 100 < max(limits) <= 120, "no row beyond the time for everything"
+    found = run("--only", "dit", "--minutes", "0.3")
+    assert {name: x for name, x in found.items() if name in stored} == {
+        name: x for name, x in stored.items() if name in found
+    }
+    assert found[unrolled] == {"status": "not measured"}
+    assert not called, "no time for a row"
     found = run("--only", "dit")
     assert len(called) == 7, "without --resume every row of the group again"
     assert found[large] == there, "rows that a run does not reach stay"
@@ -146,7 +160,7 @@ def toy(group: str, **changes):
     """A row of `tiny`, small enough to compile in about a second."""
     import rows as parts
 
-    tiny = presets.preset("tiny")
+    tiny = dataclasses.replace(presets.preset("tiny"), recon_height=48, recon_width=64)
     return parts.Row(group, tiny, 2, ladder=True, **changes)
 
 
@@ -171,7 +185,34 @@ def test_rows_run(experiment, monkeypatch, group, dtype):
     found = parts.ours(row, 2, 20.0, dtype)
     assert found["calls"] == 2 and found["xla_gb"] > 0
     assert found["flops"] == work.flops / work.frames
+    stages = {"dit": "velocity", "vggt": "reconstruct", "rays": "query rays", "vae": "decode"}
+    if group in stages:
+        assert work.flops == cost.estimate(row.config, 2, 1).flops[stages[group]]
+    else:
+        assert work.flops == parts.render_flops(row.config, 2)
+    assert found["quartiles"][0] <= found["seconds"] <= found["quartiles"][1]
     assert found["tflops"] == pytest.approx(found["flops"] / found["seconds"] / 1e12)
+
+
+def test_a_whole_video_has_the_work_of_all_its_steps(experiment, monkeypatch):
+    import rows as parts
+
+    row, evaluations = toy("sample"), []
+
+    def velocity(params, prepared, noise, x, sigma):
+        evaluations.append(float(sigma))
+        return jnp.zeros_like(x)
+
+    fake = argparse.Namespace(
+        prepare=lambda *_: argparse.Namespace(detail=None, shown=jnp.zeros(1)),
+        velocity=velocity,
+        decode=lambda params, x, detail: x,
+    )
+    monkeypatch.setattr(parts.programs, "for_window", lambda *_: fake)
+    work = parts.whole_video(row.config, row.m, {}, {}, jnp.ones(3))
+    np.testing.assert_array_equal(work.call()[0], np.ones(3))
+    assert len(evaluations) == 50
+    assert work.flops == cost.estimate(row.config, row.m, len(evaluations)).total_flops
 
 
 def test_unrolled_blocks_give_the_same(experiment):
@@ -242,6 +283,13 @@ def test_a_training_row_takes_the_first_policy_that_fits(experiment, monkeypatch
     found = parts.ours(toy("train"), 1, 1.0)
     assert tried == ["dots", "attention"] and found["failed"] == ["dots"], "near misses are tried"
     assert found["remat"] == "attention" and found["planned_gb"]["none"] == 300
+    device = argparse.Namespace(
+        memory_stats=lambda: {"bytes_limit": 64e9, "peak_bytes_in_use": 5e9}
+    )
+    with monkeypatch.context() as patched:
+        patched.setattr(jax, "local_devices", lambda: [device])
+        assert "peak_gb" not in parts.ours(toy("train"), 1, 1.0), "that of the one that failed"
+        assert parts.ours(toy("train", remat="full"), 1, 1.0)["peak_gb"] == 5
     tried.clear()
     assert parts.ours(toy("train", remat="full"), 1, 1.0)["remat"] == "full" and tried == ["full"]
     with pytest.raises(MemoryError, match="no policy fits 64 GB"):
