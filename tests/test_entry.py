@@ -99,6 +99,19 @@ class TestExitCodes:
             entry.run(lambda args: 5, argparse.ArgumentParser(), [])
         assert left.value.code == 5
 
+    def test_a_reader_that_has_enough_is_no_fault(self):
+        code = (
+            "import argparse; from roge_jax import entry\n"
+            "def main(args):\n    while True: print('x' * 1000)\n"
+            "entry.run(main, argparse.ArgumentParser(), [])"
+        )
+        command = [sys.executable, "-c", code]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            process.stdout.readline()
+            process.stdout.close()  # as `head` does
+            assert process.stderr.read() == b""
+        assert process.returncode == 1
+
     def test_warnings_are_one_line(self, capsys):
         import warnings
 
@@ -171,6 +184,18 @@ class TestCache:
             JAX_PLATFORMS="cpu",
         )
         assert any(tmp_path.glob("programs-*/*"))
+
+    def test_processors_that_differ_have_their_own_programs(self, tmp_path, monkeypatch):
+        """A machine of the same name without AVX-512 would stop at the first instruction that it lacks."""
+        monkeypatch.setenv("ROGE_CACHE", str(tmp_path))
+        folders = set()
+        for name, flags in (("A", "avx avx512f"), ("A", "avx"), ("B", "avx")):
+            for cores in (1, 2):  # of any number and speed at the moment
+                core = f"processor\t: 0\nmodel name\t: {name}\ncpu MHz\t: {cores}\nflags\t\t: {flags}\n"
+                monkeypatch.setattr(entry.Path, "exists", lambda file: True)
+                monkeypatch.setattr(entry.Path, "read_text", lambda file, said=cores * core: said)
+                folders.add(entry.cache_folder())
+        assert len(folders) == 3
 
     def test_can_be_turned_off_and_jax_setting_wins(self, tmp_path):
         code = "from roge_jax.entry import enable_cache; print(enable_cache())"
@@ -307,6 +332,12 @@ class TestRecord:
         assert record["total"]["seconds"] >= record["a"]["seconds"] + record["b"]["seconds"] - 0.002
         # This process holds at least the interpreter and NumPy, and less than a big machine.
         assert 0.02 < record["total"]["peak_memory_gb"] < 100
+
+    def test_peak_memory_is_in_gigabytes(self, monkeypatch):
+        said = "VmPeak:\t  9000000 kB\nVmHWM:\t  2000000 kB\nVmRSS:\t  1000000 kB\n"
+        monkeypatch.setattr(entry.Path, "exists", lambda file: True)
+        monkeypatch.setattr(entry.Path, "read_text", lambda file: said)
+        assert entry.peak_memory()["peak_memory_gb"] == 2.048
 
     def test_environment_names_versions_and_commit(self):
         import jax

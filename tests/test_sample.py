@@ -12,6 +12,7 @@ from scene_files import nerfstudio, truth
 from roge_jax import checkpoint, entry, inputs, model, sample, sampling, video_io
 from roge_jax.config import preset
 from roge_jax.data.scene import cameras_at, load_scene, open_scene
+from roge_jax.data.views import make_sample
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.geometry.trajectories import make_path
@@ -220,6 +221,33 @@ def test_program_agrees_with_the_model_file(weights, photos):
         return model.decode_video(params, latents, config=CONFIG)
 
     np.testing.assert_allclose(ours.frames, plain(weights, views, noise), atol=2e-4)
+
+
+@pytest.mark.parametrize("rule", ["lagernvs", "paper"])
+@pytest.mark.parametrize("m", [1, 4])
+def test_a_window_is_what_training_shows_the_networks(weights, photos, rule, m, monkeypatch):
+    """The same photos and path as a sample of a batch and as the first window of a video: the same arrays."""
+    config = dataclasses.replace(CONFIG, scale_rule=rule)
+    photos = sampling.Photos(photos.images[:m], None, photos.cameras[:m], photos.ids[:m])
+    path = make_path("orbit", photos.cameras, WINDOW)
+    seen = []
+
+    def stop(params, views, *rest):
+        seen.append(views)
+        raise UserError("seen.")
+
+    monkeypatch.setattr(sampling.programs, "for_window", stop)
+    with pytest.raises(UserError, match="seen"):
+        sampling.sample(weights, config, photos, path, SETTINGS)
+    rgb = np.concatenate([photos.images, np.zeros((WINDOW, *photos.images.shape[1:]), np.float32)])
+    K, c2w = (
+        np.concatenate([getattr(cameras, name) for cameras in (photos.cameras, path)])
+        for name in ("K", "c2w")
+    )
+    trained = make_sample(rgb, K, c2w, m, scale_rule=rule)
+    assert seen[0].keys() == trained.keys() - {"target_rgb"}
+    for name, x in seen[0].items():
+        np.testing.assert_allclose(x, trained[name], rtol=1e-6, atol=1e-6, err_msg=name)
 
 
 def test_what_settings_leave_open_is_the_models_own(weights, photos):
