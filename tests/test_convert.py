@@ -22,7 +22,7 @@ from roge_jax.config import to_dict
 from roge_jax.core import memory, params
 from roge_jax.entry import parse
 from roge_jax.errors import UserError
-from roge_jax.weights import importer, lora_export, shards, sources, wan_dit
+from roge_jax.weights import importer, lora_export, published, shards, sources, wan_dit
 from roge_jax.weights.published import RAYS
 
 CONFIG = made.CONFIG
@@ -99,6 +99,10 @@ def test_official_files_fill_every_leaf_exactly(files, tmp_path, capsys):
     record = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
     assert record["initialised"] == sorted(p for p in got if p.startswith("fusion/"))
     assert [part["option"] for part in record["converted"]] == ["--wan", "--wan-vae", "--lagernvs"]
+    assert record["converted"][2]["notes"] == [
+        "ray channels reordered from [o x d, d] to [d, o x d]"
+    ]
+    assert record["prompt"] == "read from prompt.npy"
     assert "official names" in capsys.readouterr().out
 
 
@@ -129,6 +133,8 @@ def test_diffusers_layout_and_bfloat16_source(files, tmp_path, prefix):
         tmp_path / "repo" / "vae" / "diffusion_pytorch_model.safetensors",
         made.vae_tensors(names="diffusers")[1],
     )
+    for place in (tmp_path / "repo", tmp_path / "repo" / "transformer"):
+        assert published.find_wan(place)[1] == tmp_path / "repo" / "vae"
     run("--wan", tmp_path / "repo", "--preset", files["config"], "--lagernvs", files["lagernvs"],
         "--dtype", "float32", "--out", tmp_path / "m")  # fmt: skip
     got = stored(tmp_path / "m")
@@ -168,9 +174,9 @@ def test_vggt_alone_fills_the_aggregator(files, tmp_path):
     got = stored(tmp_path / "m")
     for path, value in tree.items():
         np.testing.assert_array_equal(got[path], value, err_msg=path)
-    initialised = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"][
-        "initialised"
-    ]
+    record = json.loads((tmp_path / "m" / "config.json").read_text())["provenance"]
+    initialised = record["initialised"]
+    assert record["prompt"] == "none: all rows are zero"
     assert {p for p in initialised if p.startswith("encoder/")} == {
         p for p in got if p.startswith(("encoder/camera_mlp", "encoder/connector"))
     }
@@ -279,6 +285,29 @@ def test_a_whole_framecrafter_transformer(files, tmp_path):
     )
     rays = np.split(values["fusion/rays_embed/kernel"], 4, axis=2)
     np.testing.assert_array_equal(rays[3], tree["patch_embed/kernel"][:, :, 36:] / 4)
+
+
+def test_a_framecrafter_or_transformer_of_other_sizes_is_named(files, tmp_path):
+    plain = ["--preset", files["config"], "--random", "encoder", "renderer", "vae"]
+    other = framecrafter(dataclasses.replace(CONFIG.dit, ffn=64))[1]
+    made.save(tmp_path / "fc.safetensors", other)
+    fails(
+        r"blocks\.ffn\.fc1\.lora_b has shape \(3, 2, 64\), which does not fit \(3, 128, 96\)",
+        "--wan",
+        files["wan"],
+        *plain[:2],
+        "--framecrafter",
+        tmp_path / "fc.safetensors",
+        *("--random", "encoder", "renderer"),
+    )
+    wide = made.dit_tensors(dataclasses.replace(CONFIG.dit, in_channels=40))[1]
+    made.save(tmp_path / "wide.safetensors", wide)
+    fails(
+        "has 40 input channels, where 36 or fewer are needed",
+        "--wan",
+        tmp_path / "wide.safetensors",
+        *plain,
+    )
 
 
 @pytest.mark.parity

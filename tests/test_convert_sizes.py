@@ -63,7 +63,19 @@ def test_all_of_the_paper_maps_completely(released):
         filled_leaves = {fill.path for fill in plan.fills}
         count = params.count({p: s for p, s in plan.specs.items() if p in filled_leaves})
         assert count == 16_394_878_784 + 126_892_531 + 1_103_348_352
-        assert 36e9 < sum(plan.layout().sizes) < 37e9
+        layout = plan.layout()
+        assert 36e9 < sum(layout.sizes) < 37e9
+    rows = [line.split() for line in convert.summary(plan, filled, layout).splitlines()]
+    table = {row[0]: row[1:] for row in rows if row and row[0] in model.specs(plan.config)}
+    assert table.keys() == model.specs(plan.config).keys()
+    for network, (leaves, tensors, parameters, size, initialised) in table.items():
+        specs = params.flatten({network: model.specs(plan.config)[network]})
+        assert (int(leaves), int(parameters.replace(",", ""))) == (len(specs), params.count(specs))
+        assert int(tensors) == sum(fill.path in specs for fill in plan.fills)
+        assert int(initialised) == (len(specs) if network in ("fusion", "prompt") else 0)
+        assert float(size) <= 4e-9 * params.count(specs) + 0.01
+    whole = sum(float(row[3]) for row in table.values())
+    assert whole == pytest.approx(sum(layout.sizes) / 1e9, abs=0.05)
 
 
 def test_smaller_and_other_checkpoints_map_completely(released):
