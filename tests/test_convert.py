@@ -646,6 +646,8 @@ def test_all_mismatches_are_in_one_error(files, tmp_path):
     tensors["vace_blocks.0.weight"] = np.ones(3, np.float32)
     tensors["head.head.bias"] = np.ones(5, np.float32)
     tensors["blocks.2.self_attn.q.weight"] = np.ones((128, 128), np.int32)
+    tensors["blocks.2.self_attn.k.weight"] = np.ones((128, 128), ml_dtypes.float8_e4m3fn)  # scaled
+    tensors["blocks.0.ffn.0.weight"] = np.ascontiguousarray(tensors["blocks.0.ffn.0.weight"].T)
     made.save(tmp_path / "wan.safetensors", tensors)
     recon = made.recon_tensors()[1]
     del recon["renderer.tgt_norm.weight"]
@@ -654,13 +656,15 @@ def test_all_mismatches_are_in_one_error(files, tmp_path):
         run("--wan", tmp_path / "wan.safetensors", "--lagernvs", tmp_path / "lagernvs.safetensors",
             "--random", "vae", "--preset", files["config"], "--dry-run")  # fmt: skip
     text = str(caught.value)
-    assert text.startswith("8 tensors do not fit")
+    assert text.startswith("10 tensors do not fit")
     for line in (
         "blocks.{0..2}.norm3.bias is missing",
         "blocks.1.ffn.2.weight is missing",
         "vace_blocks.0.weight is not expected",
         "head.head.bias has shape (5,) instead of (64,)",
         "blocks.2.self_attn.q.weight has dtype int32",
+        "blocks.2.self_attn.k.weight has dtype float8_e4m3fn",
+        "blocks.0.ffn.0.weight has shape (128, 96) instead of (96, 128)",
         "renderer.tgt_norm.weight is missing",
         "wan.safetensors: ",
         "lagernvs.safetensors: ",
@@ -744,7 +748,10 @@ def test_options_of_the_prompt_that_would_be_ignored(files, tmp_path, capsys):
 
 @pytest.mark.parametrize("dtype", ["bfloat16", "float32"])
 def test_values_that_are_not_finite_are_named_and_nothing_is_written(files, tmp_path, dtype):
-    for key, value in (("blocks.1.ffn.0.weight", np.nan), ("blocks.2.norm3.bias", -np.inf)):
+    bad = [("blocks.1.ffn.0.weight", np.nan), ("blocks.2.norm3.bias", -np.inf)]
+    if dtype == "bfloat16":  # finite as it is stored, and rounded to infinity
+        bad.append(("blocks.1.ffn.0.weight", 3.4e38))
+    for key, value in bad:
         tensors = made.dit_tensors()[1]
         tensors[key] = np.array(tensors[key])
         tensors[key].flat[-1] = value
