@@ -22,7 +22,7 @@ from roge_jax.config import to_dict
 from roge_jax.core import memory, params
 from roge_jax.entry import parse
 from roge_jax.errors import UserError
-from roge_jax.weights import importer, lora_export, published, shards, sources, wan_dit
+from roge_jax.weights import importer, lora_export, prompt, published, shards, sources, wan_dit
 from roge_jax.weights.published import RAYS
 
 CONFIG = made.CONFIG
@@ -698,6 +698,14 @@ def test_a_full_disk_leaves_nothing(files, tmp_path, monkeypatch):
 def test_prompt_embedding_of_wrong_shape(files, tmp_path, shape):
     np.save(tmp_path / "p.npy", np.ones(shape, np.float32))
     fails("prompt embedding of shape", *everything(files)[:-1], tmp_path / "p.npy")
+
+
+def test_prompt_rows_and_words_that_are_no_use(files, tmp_path):
+    rows = np.ones((2, CONFIG.dit.text_dim), np.float32)
+    rows[1, 3] = np.inf
+    np.save(tmp_path / "p.npy", rows)
+    fails("the prompt embedding is not finite", *everything(files)[:-1], tmp_path / "p.npy")
+    assert prompt.cleaned("  a\n\t room &amp;amp; &lt;more ") == "a room & <more"
 
 
 def t5_folder(folder: Path, without: str = "") -> Path:
