@@ -12,6 +12,7 @@ from test_sharding import small
 from roge_jax import checkpoint, config, model, train
 from roge_jax.core import params, program, sharding
 from roge_jax.core.attention import as_on_gpu, attention, is_attention
+from roge_jax.core.layers import convolve
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
 from roge_jax.training import estimate, stages
@@ -39,6 +40,13 @@ class TestProgram:
         # Each product has a buffer; tanh overwrites it.
         assert program.peak(traced).bytes == 2 * 64 * 32 * 4
         assert program.flops(traced) == {"": 3 * 2 * 64 * 32 * 32}
+
+    def test_convolutions_are_counted(self):
+        def f(x, w):
+            return convolve(x, w).sum()
+
+        traced = program.trace(f, array(2, 8, 6, 3), array(3, 3, 3, 5))
+        assert program.flops(traced) == {"": 2 * (2 * 8 * 6 * 5) * (3 * 3 * 3)}
 
     def test_cheap_operations_have_no_buffer(self):
         def f(x, w):
