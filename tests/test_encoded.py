@@ -115,6 +115,19 @@ def test_batches_are_functions_of_seed_and_number(clips):
         assert len(set(rows)) == 3 and len({r % 2 for r in rows}) == 1
 
 
+def test_every_sample_is_drawn_as_often_as_any_other(tmp_path):
+    """Whatever its number of photos: of eight, two have more than the others."""
+
+    def draw(i):
+        m = 2 if i < 2 else 1
+        return {"context_rgb": np.zeros((1, m, 2, 2, 3)), "K": np.full((1, 2, 3, 3), float(i))}
+
+    found = encoded.Clips(tmp_path, 8, draw, lambda views: views)
+    drawn = [int(found.batch(0, i, 1)["K"][0, 0, 0, 0]) for i in range(800)]
+    counts = np.bincount(drawn, minlength=8)
+    assert np.abs(counts - 100).max() < 45  # binomial: 9.4 is one sigma
+
+
 def test_samples_of_another_run_are_left_alone_and_damage_is_named(clips, tmp_path):
     clips(4)
     with pytest.raises(UserError, match="--resume"):
