@@ -47,10 +47,19 @@ def test_an_encoded_sample_has_the_flow_loss_of_the_sample():
     views, key = views_of(config), jax.random.key(1)
     options = {"config": config, "draws": 2, "remat": "none"}
     whole = jax.jit(lambda p, v: model.scene_loss(p, v, key, **options)["flow"])(params, views)
-    clip = jax.jit(lambda p, v: encoded.encode(p, v, config=config))(params, views)
+
+    @jax.jit
+    def encode(params, views):
+        photos = model.encode_contexts(params, views["context_rgb"], config=config)
+        return encoded.encode(params, views, config=config), photos
+
+    clip, photos = encode(params, views)
     term = jax.jit(lambda p, c: encoded.flow_term(p, c, key, **options))
     np.testing.assert_allclose(term(params, clip), whole, rtol=2e-4)  # features are float16
     assert "preview" in clip
+    found = encoded.condition(params, clip, config=config)
+    np.testing.assert_allclose(found.appearance[:2, ..., 4:], photos, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(found.appearance[2:, ..., 4:], clip["preview"])
     for name in clip:  # all of it counts
         moved = clip | {name: clip[name] * 2.0}
         assert abs(float(term(params, moved)) - float(whole)) > 1e-3 * float(whole), name

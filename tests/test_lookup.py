@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_cost import abstract, array, multiplied
 
-from roge_jax import cost, model
+from roge_jax import cost, model, programs
 from roge_jax.config import RoGeConfig, preset, to_dict
 from roge_jax.core.layers import conv2d, convolve
 from roge_jax.core.params import flatten, init
@@ -266,6 +266,35 @@ def test_without_it_the_picture_is_the_rgb_heads():
     shown = decode_all(params, features, views, config=TINY, context=views)
     assert shown.rgb is shown.head is shown.photos is shown.coarse
     assert shown.rgb.shape == (1, H, W, 3)
+
+
+def test_a_window_that_is_not_generated_looks_into_its_photos_where_they_were_taken():
+    """Targets alone, as programs ask for them, get the picture that all views together give them."""
+    m, n = 2, 3
+    K, c2w = cameras(m + n, seed=5)
+    views = {
+        "context_rgb": textured_plane(K[:m], c2w[:m], 3.0),
+        "K": K,
+        "c2w": c2w,
+        "vectors": RNG.standard_normal((m, 11)).astype(np.float32),
+    }
+    params = model.init(jax.random.key(0), CONFIG)
+    params["renderer"]["lookup"] = weights(0.1)
+
+    shape = jax.eval_shape(lambda p, v: model.reconstruct(p, v, config=CONFIG), params, views).shape
+    tokens = RNG.standard_normal(shape).astype(np.float32)
+
+    @jax.jit
+    def pictures(params, tokens, views):
+        features = model.query_rays(params, tokens, views, config=CONFIG)
+        alone = model.only_targets(views)  # as if the targets' cameras were those of the photos
+        wrong = model.decode_rgb(params, features[m:], alone, config=CONFIG)
+        found = programs.rgb_head(params, views, config=CONFIG, scene_tokens=tokens)
+        return found, model.show(params, features, views, config=CONFIG), wrong
+
+    found, want, wrong = pictures(params, tokens, views)
+    np.testing.assert_allclose(found, want, atol=1e-5)
+    assert np.abs(wrong - want).max() > 1e-2
 
 
 @pytest.mark.parametrize(
