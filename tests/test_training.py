@@ -336,6 +336,17 @@ def test_the_averaged_parameters_are_evaluated(tmp_path):
     assert log_of(tmp_path / "plain")[-1]["held_sum"] == total(state["params"])["held_sum"]
 
 
+def test_the_held_out_loss_is_told_from_the_first_to_the_last(tmp_path):
+    rows = [{"step": 0, "held_loss": 2.0}, {"step": 5, "loss": 9.0}, {"step": 10, "held_loss": 1.5}]
+    rows += [{"step": 20, "held_loss": 1.25}, {"step": 30, "held_loss": None}]
+    log = tmp_path / "log.jsonl"
+    log.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    told = "; held-out loss 2 at step 0, 1.25 at step 20"
+    assert training.held_out_change(log) == told
+    log.write_text(json.dumps(rows[0]) + "\n")
+    assert training.held_out_change(log) == ""
+
+
 # Checkpoints and resuming.
 
 
