@@ -251,6 +251,17 @@ class TestEstimate:
         assert SCORES_BYTES < 4 * 6804**2 * 40, "queries in pieces"
         assert plain - fused == SCORES_BYTES
 
+    def test_numbers_have_the_unit_that_keeps_them_short(self):
+        for value, said in (
+            (1.234e15, "1.23 PB"),
+            (2e12, "2 TB"),
+            (9.99e11, "999 GB"),
+            (1e9, "1 GB"),
+            (4.5e6, "4.5 MB"),
+            (300.0, "0.3 kB"),
+        ):
+            assert cost.scaled(value, "B") == said
+
     def test_a_report_adds_up_the_windows(self):
         """Three windows: the first sees two photos, the others four with frames that were made."""
         config = preset("tiny")

@@ -186,10 +186,11 @@ def test_what_does_not_fit_is_named(base, adapter, tmp_path):
     with pytest.raises(UserError, match="exists already"):
         run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "base")
     record = json.loads((tmp_path / "base" / "config.json").read_text())
-    record["config"]["dit"]["ffn"] = 64
-    (tmp_path / "base" / "config.json").write_text(json.dumps(record))
-    with pytest.raises(UserError, match="was trained on another 'dit'"):
-        run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "m")
+    for part, name in (("fusion", "geometry_channels"), ("dit", "ffn")):
+        record["config"][part][name] //= 2
+        (tmp_path / "base" / "config.json").write_text(json.dumps(record))
+        with pytest.raises(UserError, match=f"was trained on another '{part}'"):
+            run(tmp_path / "a", "--merge", tmp_path / "base", "--out", tmp_path / "m")
     lone = params.flatten(adapter)
     del lone["dit/blocks/ffn/fc1/lora_b"]
     lone["dit/blocks/ffn/fc2/lora_a"] = lone["dit/blocks/ffn/fc2/lora_a"][..., :1]  # of rank 3 in b

@@ -158,6 +158,17 @@ def test_lora_files_of_others():
     tensors = lora_export.export_lora(factors(TINY), style="framecrafter")
     tensors["patch_embedding.weight"] = np.ones((48, 420, 1, 2, 2))
     tree, rest = lora_export.import_lora(tensors, TINY)
+    names = {"lora_A.default": "lora_down", "lora_B.default": "lora_up"}  # of older trainers
+    for prefix in ("pipe.dit.", "diffusion_model.", "transformer."):
+        other = {}
+        for key, value in tensors.items():
+            for name, old in names.items():
+                key = key.replace(name, old)
+            other[prefix + key] = value
+        found, rest = lora_export.import_lora(other, TINY)
+        assert rest.keys() == {"patch_embedding.weight"}
+        for path, leaf in params.flatten(tree).items():
+            np.testing.assert_array_equal(params.flatten(found)[path], leaf, err_msg=path)
     assert rest.keys() == {"patch_embedding.weight"}
     for block in range(TINY.depth):  # alpha / rank = 2 on one layer, which is missing from block 0
         tensors[f"blocks.{block}.ffn.0.alpha"] = np.full((1,) * block, 8.0, np.float32)
