@@ -84,8 +84,8 @@ def test_ordered_targets_are_a_run_of_frames_in_either_direction():
         contexts, targets = draw_views(np.random.default_rng(seed), FRAMES, 3, cfg)
         steps = np.diff(targets)
         assert len(targets) == 8 and len(set(steps)) == 1 and abs(steps[0]) == 1
-        assert len(set(contexts)) == 3 and 0 <= min(contexts) and max(contexts) < FRAMES
-        assert 0 <= targets.min() and targets.max() < FRAMES
+        assert len(set(contexts)) == 3 and min(contexts) >= 0 and max(contexts) < FRAMES
+        assert targets.min() >= 0 and targets.max() < FRAMES
         inside = np.isin(contexts, targets)
         assert inside.all() or not inside.any()
         if inside.all():
