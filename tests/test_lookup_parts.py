@@ -113,16 +113,52 @@ def test_the_coarse_answer_is_the_peak_and_its_neighbours():
     np.testing.assert_allclose(colours, maps[0, ..., lookup.MATCHED :], atol=2e-3)
 
 
-def test_fine_cuts_stand_a_quarter_apart_about_the_coarse_one():
-    """What the fine network favours moves the cut by its offset, and the colours are those found there."""
-    photo = RNG.random((1, H, W, 3)).astype(np.float32)
+@pytest.mark.parametrize("reach", [1.0, 0.5])
+def test_fine_cuts_stand_a_quarter_apart_about_the_coarse_one(reach):
+    """What the fine network favours moves the cut by its offset, and the colours are those found at its depth."""
+    apart, focal = 0.1, 20.0
+    K = jnp.asarray([[[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]]])
+    way = sweep.motion(K, jnp.eye(4)[None], K, jnp.eye(4)[None].at[:, 0, 3].set(apart))
+    ramp = np.broadcast_to((np.arange(W) + 0.5)[None, None, :, None], (1, H, W, 3))
     cut = jnp.asarray(RNG.uniform(2.0, 9.0, (H, W)), jnp.float32)
     for place, moves in ((0, -0.875), (5, 0.375)):
         bias = jnp.zeros(lookup.FINE).at[place].set(50.0)
         p = SILENT["fine"] | {"conv3": SILENT["fine"]["conv3"] | {"bias": bias}}
+        way_of_one = sweep.Motion(way.turn[0], way.shift[0])
         found, seen, refined = lookup._fine(
-            p, jnp.asarray(photo), jnp.eye(1), CUTS, own_camera(), 1.0, cut, jnp.zeros((H, W, 3))
+            p,
+            jnp.asarray(ramp, jnp.float32),
+            jnp.eye(1),
+            CUTS,
+            way_of_one,
+            reach,
+            cut,
+            jnp.zeros((H, W, 3)),
         )
         np.testing.assert_allclose(refined, cut + moves, rtol=1e-5)
-        np.testing.assert_allclose(found, photo, atol=2e-3)
-        np.testing.assert_array_equal(seen, 1.0)
+        inverse = (reach * np.asarray(cut + moves) / (CUTS - 1)) ** sweep.SPACING / sweep.NEAREST
+        want = ramp[0, ..., 0] - focal * apart * inverse
+        inside = (want > 0.5) & (want < W - 0.5)
+        assert inside.mean() > 0.5 and np.all(np.asarray(seen)[0, ..., 0][inside] == 1.0)
+        np.testing.assert_allclose(np.asarray(found)[0, ..., 0][inside], want[inside], atol=5e-3)
+
+
+@pytest.mark.parametrize(("favoured", "near"), [(2, False), (7, True)])
+def test_a_photo_from_aside_is_far_from_near_things_and_close_to_distant_ones(favoured, near):
+    """Of a photo from the view's own place, turned a little, and one from beside it: parallax is distance over depth."""
+    p = init(jax.random.key(0), lookup.lookup_specs(D, 8, CUTS))
+    p = jax.tree.map(jnp.zeros_like, p)
+    likely = jnp.concatenate([30.0 * jax.nn.one_hot(favoured, CUTS), jnp.zeros(lookup.WIDTH)])
+    p["prior"]["bias"] = jnp.tile(likely, 4)
+    K = jnp.tile(jnp.asarray([[[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]]), (2, 1, 1))
+    s, c = np.sin(0.2), np.cos(0.2)
+    turned = jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    seen_by = jnp.tile(jnp.eye(4), (2, 1, 1)).at[0, :3, :3].set(turned).at[1, 0, 3].set(0.2)
+    photos = jnp.broadcast_to(jnp.asarray([0.2, 0.8])[:, None, None, None], (2, H, W, 3))
+    features, head = jnp.zeros((1, H // 8, W // 8, D)), jnp.full((1, H, W, 3), 0.5)
+    of = K[:1], jnp.eye(4)[None]
+    found = lookup.look_up(p, features, head, photos, of, (K, seen_by), cuts=CUTS)
+    distances = np.array([2 * np.sin(0.1), 0.2 * sweep.inverse_depth(jnp.float32(favoured), CUTS)])
+    share = distances**-2.0 / (distances**-2.0).sum()
+    assert (share[0] > 0.75) if near else (share[0] < 0.25)
+    np.testing.assert_allclose(np.median(found.photos), share @ [0.2, 0.8], atol=0.03)
