@@ -236,6 +236,26 @@ def test_the_loss_ignores_context_slots():
     np.testing.assert_allclose(got, float(weight) * error, rtol=1e-5)
 
 
+def test_the_noise_levels_of_a_step_are_one_from_each_part(monkeypatch):
+    """The mean over 40 levels hardly varies between keys; that of 40 free draws would by 0.04."""
+
+    def level(params, x0, cond, key, *, config, contexts, part=None):
+        return flow.training_sigma(key, shift=config.flow.shift, part=part)
+
+    monkeypatch.setattr(model, "flow_matching", level)
+    options = {"config": CONFIG, "contexts": M}
+    means = [
+        model.mean_flow_matching({}, None, None, jax.random.key(i), draws=40, **options)
+        for i in range(8)
+    ]
+    assert 0.0 < np.std(means) < 0.01
+    ones = [
+        float(model.mean_flow_matching({}, None, None, jax.random.key(i), draws=1, **options))
+        for i in range(8)
+    ]
+    assert np.std(ones) > 0.05
+
+
 # Symmetry of the context slots.
 
 

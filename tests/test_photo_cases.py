@@ -91,6 +91,7 @@ def test_exif_orientation(tmp_path, orientation):
         )
         files.save(other / "images" / "0000.png", stored, exif=exif)
         scene = load_scene(other)
+        assert scene.sizes == [(HEIGHT, WIDTH)]  # before pixels are decoded
         np.testing.assert_allclose(scene.images[0] * 255, upright, atol=1e-4)
         np.testing.assert_allclose(scene.cameras.K, truth.K, atol=1e-9)
         np.testing.assert_allclose(scene.cameras.c2w, truth.c2w, atol=1e-9)
