@@ -18,7 +18,7 @@ from roge_jax.data import coverage
 from roge_jax.data.scene import load_scene, select_context
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
-from roge_jax.geometry.trajectories import make_path
+from roge_jax.geometry.trajectories import focus_distance, make_path
 from roge_jax.planning import proxies, table
 from roge_jax.planning.options import full_choices, list_options
 from roge_jax.recon.ray_scene import attend, merge_scene
@@ -348,6 +348,21 @@ def test_coverage_knows_no_unit_and_no_frame(photos, path):
         np.mean(np.abs(here - there) > 1e-6) < 0.002
     )  # points on a picture's border may fall either way
     assert here.min() >= 0 and here.max() <= 1 and here.mean() > 0.05
+
+
+def test_photos_from_further_away_are_worth_less_and_from_closer_no_more():
+    """Along one line of sight a photo is worth the target's distance over its own, at most 1."""
+    K = np.array([[1e5, 0, 32], [0, 1e5, 18], [0, 0, 1]])  # a pencil of rays: no angle between them
+    c2w = np.tile(np.eye(4), (3, 1, 1))
+    c2w[:, 2, 3] = 0.0, -1.0, 0.5
+    photos = Cameras(np.tile(K, (3, 1, 1)), c2w)
+    worth = coverage.coverage(photos, photos[:1], 36, 64)
+    depths = focus_distance(photos) * np.array(coverage.DEPTHS)
+    assert depths[0] > 0.5  # all in front of every photo
+    expected = np.tile(depths / (depths + 1.0), worth.shape[1] // len(depths))
+    np.testing.assert_allclose(worth[1], expected, rtol=1e-3)
+    np.testing.assert_allclose(worth[[0]], 1.0, rtol=1e-3)
+    np.testing.assert_allclose(worth[2][worth[2] > 0], 1.0, rtol=2e-2)
 
 
 def test_the_window_that_is_seen_best_is_the_one_not_generated(photos):

@@ -533,6 +533,18 @@ def test_the_average_starts_fast_and_slows_down():
     )
 
 
+def test_the_average_is_over_the_parameters_after_each_step():
+    optimiser = make_optimiser(OPTIM, SPECS, 10)
+    step = jax.jit(training.make_step(objective, optimiser, OPTIM))
+    state = training.initial_state(start(), optimiser, OPTIM)
+    average = np.asarray(state["params"]["layer"]["kernel"])
+    for i in range(3):
+        state, _ = step(state, {}, batch_of(i), jax.random.key(i))
+        rate = min(OPTIM.ema, (1 + i) / (10 + i))
+        average = rate * average + (1 - rate) * np.asarray(state["params"]["layer"]["kernel"])
+        np.testing.assert_allclose(state["ema"]["layer"]["kernel"], average, rtol=1e-6)
+
+
 def test_muon_takes_the_hidden_matrices_and_nothing_else():
     """Kernels at the border of the network keep Adam: pixels, rays, latents, noise levels, words, camera vectors."""
     specs = model.specs(preset("tiny"))
