@@ -89,7 +89,12 @@ def test_what_is_shared_must_be_a_quarter_of_both_pictures(row):
 
 def test_after_a_miss_the_next_try_is_a_quarter_closer(row):
     found, asked = row(2, lambda i, j: (0.1, 0.1))
-    assert [abs(i - j) for i, j in asked] == [3, 2, 1, 1]  # in the end the nearest, whatever it shares
+    assert [abs(i - j) for i, j in asked] == [
+        3,
+        2,
+        1,
+        1,
+    ]  # in the end the nearest, whatever it shares
     assert found == [3, 4]
 
 

@@ -286,6 +286,24 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(tmp_path):
     assert sorted(int(p.name) for p in (tmp_path / "checkpoints").iterdir()) == [10]
 
 
+@pytest.mark.parametrize("ema", [0.9, 0.0])
+def test_what_is_evaluated_is_what_is_saved(tmp_path, ema):
+    """The average where there is one, as the model that comes out of the run."""
+    seen = []
+
+    def evaluate(p):
+        seen.append(jax.tree.map(np.array, p))
+        return {"held_loss": 1.0}
+
+    optim = dataclasses.replace(OPTIM, ema=ema)
+    state = run(tmp_path, 20, optim=optim, evaluate=evaluate, evaluate_every=10)
+    assert len(seen) == 3
+    assert_same(seen[-1], state["ema" if ema else "params"])
+    assert np.any(
+        seen[-1]["layer"]["kernel"] != np.asarray(state["params"]["layer"]["kernel"])
+    ) == bool(ema)
+
+
 # Checkpoints and resuming.
 
 
@@ -523,6 +541,27 @@ def test_accumulated_steps_equal_one_step_on_the_mean_gradient():
     want, _ = make_optimiser(cfg, SPECS, 30).update(mean, one.init(p), p)
     for path, value in flatten(updates).items():
         np.testing.assert_allclose(value, flatten(want)[path], rtol=1e-5)
+
+
+def test_the_rate_of_accumulated_steps_falls_as_the_updates_end():
+    """20 steps of two that make 10 updates: the sizes of 10 steps, warm-up and decay included."""
+    p = start()
+    g = jax.tree.map(jnp.ones_like, p)
+
+    def sizes(accumulate):
+        cfg = OptimConfig(
+            learning_rate=0.1, warmup=2, decay=0.5, weight_decay=0.0, accumulate=accumulate
+        )
+        optimiser = make_optimiser(cfg, SPECS, 10 * accumulate)
+        state, found = optimiser.init(p), []
+        for _ in range(10 * accumulate):
+            updates, state = optimiser.update(g, state, p)
+            found.append(abs(float(updates["layer"]["bias"][0])))
+        return [size for size in found if size > 0]
+
+    plain = sizes(1)
+    assert len(plain) == 10 and plain[-1] < 0.3 * max(plain)
+    np.testing.assert_allclose(sizes(2), plain, rtol=1e-4)
 
 
 def test_the_average_starts_fast_and_slows_down():
