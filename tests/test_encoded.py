@@ -115,6 +115,17 @@ def test_batches_are_functions_of_seed_and_number(clips):
         assert len(set(rows)) == 3 and len({r % 2 for r in rows}) == 1
 
 
+def test_every_sample_is_as_likely_whatever_its_number_of_photos(tmp_path):
+    def draw(i):
+        return {"context_rgb": np.zeros((1, 1 if i < 2 else 2, 2, 2, 3)), "K": np.full((1, 1), i)}
+
+    found = encoded.Clips(tmp_path, 8, draw, lambda views: views)
+    drawn = [int(found.batch(0, i, 1)["K"][0, 0]) for i in range(400)]
+    counts = np.bincount(drawn, minlength=8)
+    assert 0.2 < counts[:2].sum() / 400 < 0.3  # two of eight
+    assert counts.min() > 25
+
+
 def test_samples_of_another_run_are_left_alone_and_damage_is_named(clips, tmp_path):
     clips(4)
     with pytest.raises(UserError, match="--resume"):

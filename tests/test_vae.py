@@ -115,6 +115,20 @@ def test_chunks_equal_the_whole(small):
     assert rel_l2(chunked, decode(params, latents)) <= 1e-5
 
 
+def test_a_clip_goes_in_chunks_as_soon_as_its_largest_map_is_too_large(monkeypatch):
+    """The limit counts frames and pixels of the video, whichever way it goes."""
+    frames, height, width = 13, 16, 24
+    video = jnp.zeros((frames, height, width, 3))
+    latents = jnp.zeros((4, height // 8, width // 8, SMALL.latent))
+    largest = 4.0 * frames * height * width * SMALL.base  # float32
+    for name in ("encode", "encode_chunked", "decode", "decode_chunked"):
+        monkeypatch.setattr(vae, name, lambda p, x, *, cfg, name=name: name)
+    for limit, ending in ((largest, ""), (largest - 1, "_chunked")):
+        monkeypatch.setattr(vae, "SINGLE_PASS_BYTES", limit)
+        assert vae.encode_any({}, video, cfg=SMALL) == "encode" + ending
+        assert vae.decode_any({}, latents, cfg=SMALL) == "decode" + ending
+
+
 def test_one_frame_equals_the_first_of_many(small):
     params, video, latents = small
     assert rel_l2(encode(params, video[:1]), encode(params, video)[:1]) <= 1e-5
