@@ -12,7 +12,7 @@ import pytest
 from scene_files import nerfstudio, truth
 
 import roge_jax as rj
-from roge_jax import checkpoint, cost, entry, model, sample, sampling
+from roge_jax import checkpoint, cost, entry, model, programs, sample, sampling
 from roge_jax.config import preset
 from roge_jax.data import coverage
 from roge_jax.data.scene import load_scene, select_context
@@ -388,10 +388,32 @@ def test_one_photo_can_be_planned_for(make, photos):
 # ---- what a reduced run computes ------------------------------------------------------------------
 
 
-def test_targets_keep_their_noise_when_photos_are_dropped():
-    full = sampling.window_noise(3, 0, 4, CONFIG)
-    fewer = full[-CONFIG.slots(2) :]
-    np.testing.assert_array_equal(fewer[2:], full[4:])
+@pytest.mark.parametrize("long", ["chain", "independent"])
+def test_targets_keep_their_noise_when_photos_are_dropped(photos, path, monkeypatch, long):
+    """In every window: what is generated differs by what is seen, not by another draw."""
+    drawn = []
+
+    def without_network(params, views, config, slots):
+        video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
+
+        def velocity(params, prepared, noise, x, sigma):
+            drawn.append((np.asarray(noise), config.slots(0)))
+            return 0 * x
+
+        shown = types.SimpleNamespace(shown=video, detail=None)
+        return programs.Programs(lambda *_: shown, velocity, lambda *_: video)
+
+    monkeypatch.setattr(programs, "for_window", without_network)
+    full = full_choices(photos, CONFIG, path, SETTINGS)
+    found = []
+    for kept in ((0, 1, 2, 3), (1, 3)):
+        drawn.clear()
+        choices = dataclasses.replace(full, photos=kept, steps=1)
+        run({}, photos, path, choices, {}, long=long)
+        found.append([noise[-slots:] for noise, slots in drawn])
+    assert len(found[0]) == len(found[1]) == 2
+    np.testing.assert_array_equal(*found)
+    assert np.any(found[0][0] != found[0][1])
 
 
 def test_every_knob_changes_the_run_as_it_says(weights, photos, path):
