@@ -14,7 +14,7 @@ from roge_jax import checkpoint, entry, inputs, model, programs, sample, samplin
 from roge_jax.config import preset
 from roge_jax.data.scene import cameras_at, load_scene, open_scene
 from roge_jax.errors import UserError
-from roge_jax.geometry.cameras import Cameras, concatenate, normalise
+from roge_jax.geometry.cameras import RULES, Cameras, concatenate, normalise
 from roge_jax.geometry.trajectories import make_path
 
 CONFIG = preset("tiny")
@@ -203,6 +203,27 @@ def test_chained_windows_share_one_compilation_and_remember(weights, photos):
     assert np.abs(result.preview[WINDOW:] - other.preview[WINDOW:]).max() > 1e-4
 
 
+def numbered(seen):
+    """In place of `programs.for_window`: what windows see is added to `seen`, and frame i gets the level i / 100.
+    Nothing is compiled."""
+
+    def for_window(params, views, config, slots):
+        size = (config.frames, config.height, config.width, 3)
+        recon = (config.frames, config.recon_height, config.recon_width, 3)
+
+        def prepare(params, views):
+            seen.append({name: np.asarray(x) for name, x in views.items()})
+            return SimpleNamespace(shown=np.zeros(recon, np.float32), detail=None)
+
+        def decode(params, x0, detail):
+            levels = (config.frames * (len(seen) - 1) + np.arange(config.frames)) / 100
+            return np.broadcast_to(levels[:, None, None, None], size).astype(np.float32)
+
+        return programs.Programs(prepare, lambda p, ready, noise, x, sigma: 0 * x, decode)
+
+    return for_window
+
+
 @pytest.mark.parametrize(("most", "made_before"), [(4, 1), (6, 2)], ids=["photos go", "all stay"])
 def test_pictures_of_chained_windows_keep_their_cameras(place, monkeypatch, most, made_before):
     """Photos and frames already made come with their own pose, lens and picture at both sizes, in one frame and unit."""
@@ -210,25 +231,7 @@ def test_pictures_of_chained_windows_keep_their_cameras(place, monkeypatch, most
     photos = sampling.read_photos(load_scene(place / "scene"), [2, 0, 3, 1], config)
     path = make_path("orbit", photos.cameras, 3 * WINDOW, degrees=25)
     seen = []
-
-    def numbered(params, views, config, slots):
-        """Programs that give frame i the level i / 100: nothing is compiled."""
-
-        def prepare(params, views):
-            seen.append({name: np.asarray(x) for name, x in views.items()})
-            shown = np.zeros(
-                (config.frames, config.recon_height, config.recon_width, 3), np.float32
-            )
-            return SimpleNamespace(shown=shown, detail=None)
-
-        def decode(params, x0, detail):
-            levels = (config.frames * (len(seen) - 1) + np.arange(config.frames)) / 100
-            size = (config.frames, config.height, config.width, 3)
-            return np.broadcast_to(levels[:, None, None, None], size).astype(np.float32)
-
-        return programs.Programs(prepare, lambda p, ready, noise, x, sigma: 0 * x, decode)
-
-    monkeypatch.setattr(programs, "for_window", numbered)
+    monkeypatch.setattr(programs, "for_window", numbered(seen))
     result = sampling.sample({}, config, photos, path, SETTINGS)
     assert [len(window["generated"]) for window in result.windows] == [0, made_before, made_before]
     assert [len(window["photos"]) for window in result.windows][1:] == [most - made_before] * 2
@@ -246,6 +249,25 @@ def test_pictures_of_chained_windows_keep_their_cameras(place, monkeypatch, most
         np.testing.assert_allclose(views["K"], every.K, rtol=1e-5)
         contexts = len(kept) + len(made)
         np.testing.assert_allclose(views["vectors"][:, :3], every.centres[:contexts], atol=1e-5)
+
+
+@pytest.mark.parametrize("long", ["chain", "independent"])
+def test_a_scale_of_the_user_divides_all_positions(photos, monkeypatch, long):
+    seen, plain = [], []
+    path = make_path("orbit", photos.cameras, 2 * WINDOW)
+    settings = sampling.Settings(steps=1, solver="euler", long=long)
+    for found, scale in ((plain, None), (seen, 7.0)):
+        monkeypatch.setattr(programs, "for_window", numbered(found))
+        settings = dataclasses.replace(settings, scale=scale)
+        result = sampling.sample({}, CONFIG, photos, path, settings)
+    assert result.normalisation.divisor == 7.0
+    reach = result.normalisation.context_reach
+    for views, others in zip(seen, plain, strict=True):
+        ratio = RULES[CONFIG.scale_rule] * reach / 7.0
+        np.testing.assert_allclose(
+            views["c2w"][:, :3, 3], ratio * others["c2w"][:, :3, 3], atol=1e-5
+        )
+        np.testing.assert_allclose(views["vectors"][:, 9], reach / 7.0, rtol=1e-5)
 
 
 def test_program_agrees_with_the_model_file(weights, photos):
