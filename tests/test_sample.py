@@ -476,6 +476,13 @@ def test_field_of_view_and_size(place, photos):
     )
 
 
+def test_the_reconstruction_keeps_its_share_of_another_size():
+    config = inputs.model_config(
+        arguments("--checkpoint", "paper", "--size", "96x160"), weights=False
+    )
+    assert (config.recon_height, config.recon_width) == (144, 240)  # 1.5 times, as the paper's
+
+
 def test_path_files_are_followed(tmp_path, photos):
     from roge_jax.geometry.paths import save_path
 
@@ -507,6 +514,18 @@ def test_photos_are_chosen_for_a_path_that_is_known(tmp_path, place):
         assert len(path) == 2
         _, photos, _ = inputs.read_inputs(arguments(*words, "--context", "3,0"), CONFIG, settings)
         assert photos.ids == (3, 0)
+
+
+def test_a_path_without_a_lens_is_judged_by_that_of_the_video(tmp_path, place, monkeypatch):
+    """Photos are chosen for what the video will show: in its pixels, not in those of the photos."""
+    poses = [{"pose": pose.tolist()} for pose in load_scene(place / "scene").cameras.c2w[:2]]
+    (tmp_path / "path.json").write_text(json.dumps({"convention": "opencv", "frames": poses}))
+    asked = []
+    monkeypatch.setattr(sampling, "context_ids", lambda *a: asked.append(a[-1]) or [0, 1])
+    words = ["--scene", place / "scene", "--trajectory", tmp_path / "path.json"]
+    path = inputs.read_inputs(arguments(*words), CONFIG, SETTINGS.of(CONFIG))[2]
+    np.testing.assert_allclose(asked[0].K, path.K)
+    np.testing.assert_allclose(asked[0].c2w, path.c2w)
 
 
 def test_convention_reaches_the_reader(place, monkeypatch):
