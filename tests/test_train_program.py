@@ -148,6 +148,22 @@ def test_the_error_of_the_preview_is_measured_and_the_head_starts_again(common):
     )
 
 
+def test_the_model_that_is_saved_is_the_average(common, cheap, tmp_path, monkeypatch):
+    kept, train = {}, loop.train
+
+    def averaged(*arguments, **more):
+        state = train(*arguments, **more)
+        kept.update(flatten(jax.tree.map(lambda x: np.asarray(x) + 0.25, state["params"])))
+        return state | {"ema": unflatten(kept)}
+
+    monkeypatch.setattr(loop, "train", averaged)
+    run(*common, "--stage", "prior", "--steps", 1, "--batch", 1, "--out", tmp_path)
+    found = flatten(load_model(tmp_path / "prior/model")[0])
+    assert kept
+    for path, leaf in kept.items():
+        np.testing.assert_array_equal(found[path], leaf, err_msg=path)
+
+
 def test_a_preview_is_measured_again_once_the_latents_moved(monkeypatch):
     """Its error is one of latents: a VAE that encodes otherwise forgets it, one that decodes otherwise does not."""
     cfg = config.preset("tiny")
