@@ -203,6 +203,17 @@ def test_the_sweep_refuses_planes_that_barely_overlap():
     assert fair.overlap >= 0.5 and fair.depth > greedy.depth
     none = bl.plane_sweep(*args, depths=np.array([1.05, 1.15]))
     assert 0.0 < none.overlap < 0.5  # nothing overlaps enough: the best there is
+    assert bl.plane_sweep(*args, depths=np.array([greedy.depth, 1.6])).depth == 1.6
+
+
+@pytest.mark.parametrize(("levels", "apart"), [((0.4, 0.6), 0.2), ((0.4, 0.5, 0.6), 0.02**0.5)])
+def test_disagreement_is_the_root_mean_square_difference_of_two_photos(levels, apart):
+    """However many photos there are: of flat ones the root of the mean square over pairs."""
+    rgb = np.stack([np.full((H, W, 3), level) for level in levels])
+    n = len(levels)
+    poses = np.stack([pose((0.01 * i, 0, 0)) for i in range(n)])
+    found = bl.plane_sweep(rgb, np.stack([K] * n), poses, K, pose(), (H, W), np.array([10.0]))
+    np.testing.assert_allclose(found.disagreement, apart, rtol=1e-6)
 
 
 def test_the_sweep_with_one_photo_or_no_baseline_means_rotation_only():

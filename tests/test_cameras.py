@@ -175,6 +175,15 @@ def test_targets_do_not_set_the_scale():
     assert not first.notes and "times as far" in second.notes[0]
 
 
+def test_rounding_of_map_coordinates_is_no_baseline():
+    """A tripod whose centres differ in the last digits, targets included: nothing is blown up to unit size."""
+    every = random_cameras(np.random.default_rng(6), 5)
+    every.c2w[:, :3, 3] = 5e6 + 1e-9 * np.arange(15).reshape(5, 3)
+    context, target, info = normalise(every[:3], every[3:])
+    assert info.status == "coincident_centres" and info.divisor == 1.0
+    assert np.abs(context.centres).max() < 1e-7 and np.abs(target.centres).max() < 1e-7
+
+
 @few
 @given(seeds, st.integers(1, 4), st.sampled_from(["spread", "straight", "tripod", "far target"]))
 def test_world_frame_is_free(seed, m, kind):

@@ -81,6 +81,9 @@ def test_training_table_equals_the_published_one():
     # float32 exp near 0.6 minus exp(-1/2): an ulp of 0.6, times the scale 1000 / 189.5
     np.testing.assert_allclose(close, weights, rtol=0, atol=5.3 * 2 * FLOAT32)
     np.testing.assert_array_equal(flow.loss_weight(jnp.ones(2), weighting="uniform"), np.ones(2))
+    for shift in (1.0, 3.0, 12.0):  # the loss keeps its scale whatever the shift
+        weight = flow.loss_weight(flow.training_table(shift)[0], shift=shift)
+        np.testing.assert_allclose(weight.mean(), 1.0, rtol=1e-5)
 
 
 def test_rounding_timesteps_to_bfloat16_moves_training_indices_as_published():
@@ -120,7 +123,7 @@ def test_training_sigmas_follow_their_distribution():
 
 @pytest.mark.parametrize("method", ["uniform_index", "logit_normal"])
 def test_stratified_sigmas_take_one_from_each_part_and_keep_the_distribution(method):
-    draw = functools.partial(flow.training_sigma, method=method)
+    draw = functools.partial(flow.training_sigma, method=method, mean=0.4, std=1.7, shift=3.0)
     parts = [np.asarray(draw(jax.random.key(j), (2000,), part=(j, 4))) for j in range(4)]
     for lower, upper in itertools.pairwise(parts):
         assert lower.max() <= upper.min()

@@ -139,6 +139,15 @@ def test_opengl_read_as_opencv():
     with pytest.warns(CameraWarning, match="convention='opengl'"):
         check_cameras(wrong)
     np.testing.assert_allclose(to_opencv(wrong.c2w, "opengl"), good.c2w)
+    stairs = looking_at_origin(
+        6
+    )  # looking outward at every height: axes pass far behind each other
+    angles = np.radians(50.0 * np.arange(6))
+    z = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    down = np.tile([0.0, 0.0, -1.0], (6, 1))
+    stairs.c2w[:, :3, :3] = np.stack([np.cross(down, z), down, z], -1)
+    stairs.c2w[:, :3, 3] = z - 1.5 * np.arange(6)[:, None] * down
+    assert not inspect(stairs, HEIGHT, WIDTH)[1]
 
 
 @pytest.mark.parametrize("size", [1e-7, 1e-6, 1e-4, 1e-3, 0.03, 0.3])
@@ -267,6 +276,8 @@ def test_wide_views():
     cameras = with_K(fx=8.0, fy=8.0)
     with pytest.warns(CameraWarning, match="field of view 136"):
         check_cameras(cameras)
+    with pytest.warns(CameraWarning, match="field of view 116 x 123"):  # across and down
+        check_cameras(with_K(fx=12.5, fy=6.5))
     rays = np.asarray(plucker(cameras.K, cameras.c2w, HEIGHT, WIDTH))
     np.testing.assert_allclose(np.linalg.norm(rays[..., :3], axis=-1), 1.0, atol=1e-6)
 
@@ -354,7 +365,7 @@ def test_points_behind_the_camera():
 
 def test_nearly_parallel_rays():
     """Below one degree a point is at infinity; distances stay exact for parallel lines."""
-    centres = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    centres = np.array([[0.4, -0.3, 0.2], [1.4, -0.3, 0.2]])
     for angle, expected in ((0.0, False), (0.5, False), (2.0, True)):
         tilt = np.radians(angle)
         d = np.array([[0.0, 0.0, 1.0], [-np.sin(tilt), 0.0, np.cos(tilt)]])

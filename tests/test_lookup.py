@@ -389,6 +389,51 @@ def test_its_stage_trains_all_of_it_and_nothing_else():
         assert np.any(g) and np.all(np.isfinite(g)), path
 
 
+def test_targets_alone_are_shown_as_among_all_views():
+    """What a window shows that is not generated: no rays of the photos, but their pictures from their own places."""
+    params = model.init(jax.random.key(0), CONFIG)
+    params["renderer"]["lookup"] = weights(0.1)
+    kernel = params["renderer"]["rgb_head"]["linear"]["kernel"]
+    params["renderer"]["rgb_head"]["linear"]["kernel"] = kernel + 0.1
+    views = {name: x[0] for name, x in one_batch().items() if name != "target_rgb"}
+
+    @jax.jit
+    def among_all(params, views):
+        tokens = model.reconstruct(params, views, config=CONFIG)
+        features = model.query_rays(params, tokens, views, config=CONFIG)
+        return model.show(params, features, views, config=CONFIG)
+
+    alone = jax.jit(functools.partial(programs.rgb_head, config=CONFIG))(params, views)
+    want = among_all(params, views)
+    np.testing.assert_allclose(alone, want, atol=1e-4)
+    moved = views | {"c2w": views["c2w"].at[0, 0, 3].add(0.5)}  # where the photos stand counts
+    assert np.abs(among_all(params, moved) - want).mean() > 1e-3
+
+
+def test_its_loss_is_that_of_the_picture_and_less_of_its_levels(monkeypatch):
+    """Mean squares: all of the picture's, three tenths of what the photos alone and the coarse level miss."""
+    target = jnp.full((1, 2, H, W, 3), 0.4)
+    views = {
+        "target_rgb": target,
+        "context_rgb": jnp.zeros((1, 1, H, W, 3)),
+        "K": jnp.ones((1, 3, 3, 3)),
+        "c2w": jnp.ones((1, 3, 4, 4)),
+    }
+    small = jnp.full((2, H // 4, W // 4, 3), 0.4)
+    shown = lookup.Looked(target[0] + 0.1, target[0] - 0.4, target[0] - 0.2, small + 0.3)
+    monkeypatch.setattr(model, "reconstruct", lambda *_, **__: None)
+    monkeypatch.setattr(model, "query_rays", lambda *_, **__: None)
+    monkeypatch.setattr(stages, "decode_all", lambda *_, **__: shown)
+    for lookup_too, want in ((True, 0.01 + 0.3 * (0.04 + 0.09)), (False, 0.01)):
+        loss, told = stages.recon_objective(
+            {}, {}, views, jax.random.key(0), config=CONFIG, stage=stage(lookup=lookup_too)
+        )
+        np.testing.assert_allclose(loss, want, rtol=1e-5)
+        np.testing.assert_allclose(told["psnr"], 20.0, rtol=1e-5)
+        if lookup_too:
+            np.testing.assert_allclose(told["psnr_photos"], -10 * np.log10(0.04), rtol=1e-5)
+
+
 def test_other_reconstruction_stages_leave_it_out():
     for one in stages.mini_stages():
         if one.name in ("recon_low", "recon"):

@@ -223,6 +223,14 @@ def test_partial_registration_is_reported_and_fails_below_ninety_percent():
     np.testing.assert_allclose(
         result["rpe_r"], np.sqrt(np.mean(np.delete(angles, 3) ** 2)), rtol=1e-9
     )
+    # the unit is the length of the whole path, missing frames included
+    length = geo.path_length(truth[:, :3, 3])
+    np.testing.assert_allclose(result["path_length"], length, rtol=1e-12)
+    aligned = geo.umeyama(estimate[kept, :3, 3], truth[kept, :3, 3]).poses(estimate[kept])
+    shifts, _ = geo.relative_pose_errors(aligned, truth[kept])
+    np.testing.assert_allclose(
+        result["rpe_t"], np.sqrt(np.mean(np.delete(shifts, 3) ** 2)) / length, rtol=1e-9
+    )
     estimate[6] = np.nan
     result = geo.trajectory_errors(estimate, truth)
     assert result["status"] == "failed: 17 of 20 frames registered" and np.isnan(result["ape_t"])
@@ -284,6 +292,11 @@ def test_moving_points_across_their_lines_gives_that_distance():
     np.testing.assert_allclose(epipolar.symmetric_epipolar_distance(x, y, F), 1.75, rtol=1e-12)
     curve = epipolar.tsed_from_matches([(x, y)], K, c2w)["curve"]
     assert curve[1.5] == 0.0 and curve[2.0] == 1.0
+    # A second camera of twice the focal length: as far from the lines there, half as far from those of the first.
+    K[1] = np.diag([200.0, 200, 1])
+    F = epipolar.fundamental(K[0], c2w[0], K[1], c2w[1])
+    far = epipolar.symmetric_epipolar_distance(x, 2 * x + np.array([5.0, 1.6]), F)
+    np.testing.assert_allclose(far, (1.6 + 0.8) / 2, rtol=1e-12)
 
 
 def test_the_thresholds_are_strict_in_pixels_and_inclusive_in_matches():
@@ -350,6 +363,28 @@ def test_sift_matches_follow_the_pixel_convention():
     x, y = epipolar.sift_matches(frames[0], frames[1])
     assert len(x) > 50
     np.testing.assert_allclose(np.median(x - y, axis=0), [6.0, 0.0], atol=0.05)
+
+
+def test_sift_matches_are_the_same_either_way():
+    """Both pictures choose each other: what one of them finds and the other would not is no match."""
+    frames, _, _ = textured_pan()
+    noise = 0.05 * np.random.default_rng(5).standard_normal(frames[0].shape)
+    one, other = frames[0], np.clip(frames[3, ::-1] * 0.3 + frames[3] * 0.7 + noise, 0.0, 1.0)
+    there, back = epipolar.sift_matches(one, other), epipolar.sift_matches(other, one)
+    pairs = {tuple(pair) for pair in np.concatenate(there, axis=1)}
+    assert pairs == {tuple(pair) for pair in np.concatenate(back[::-1], axis=1)}
+    assert len(pairs) > 5
+
+
+def test_tsed_scales_the_cameras_with_the_frames(monkeypatch):
+    """Exact matches in frames of half the size are exact for cameras of half the size, each axis by its own factor."""
+    K, c2w, _, matches = epipolar_scene(np.random.default_rng(0))
+    frames = np.zeros((5, 262, 241, 3))
+    scale = np.array([120 / 241, 130 / 262])
+    small = iter([(x * scale, y * scale) for x, y in matches])
+    monkeypatch.setattr(epipolar, "sift_matches", lambda a, b: next(small))
+    result = epipolar.tsed(frames, K, c2w, side=120)
+    assert result["tsed"] == 1.0 and result["median_sed"] < 1e-9
 
 
 def test_tsed_of_frames_right_reversed_and_grey():

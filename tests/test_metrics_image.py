@@ -171,6 +171,12 @@ def test_gradient_psnr_is_closed_form_on_a_ramp_and_ignores_exposure():
     np.testing.assert_allclose(
         im.gradient_psnr(flat, truth), -10 * np.log10(0.01**2 / 2), rtol=1e-9
     )
+    # what lies outside [0, 1] is not shown: no gradient there
+    np.testing.assert_allclose(
+        im.gradient_psnr(flat + 0.9 * (truth > 0.4), truth),
+        im.gradient_psnr(np.where(truth > 0.4, 1.0, 0.5), truth),
+        rtol=1e-9,
+    )
     # an offset changes PSNR (14 dB) but leaves no gradient but rounding
     assert im.gradient_psnr(truth + 0.2, truth) == im.CAP_DB
     np.testing.assert_allclose(im.psnr(truth + 0.2, truth), -20 * np.log10(0.2), rtol=1e-9)

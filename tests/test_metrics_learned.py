@@ -85,6 +85,36 @@ def test_parity_with_pytorch_on_random_weights(trunk):
     np.testing.assert_allclose(found, torch_lpips(trunk, tensors, a, b), rtol=1e-5)
 
 
+def numpy_alex(tensors, image):
+    """The five taps of AlexNet for one image [h, w, 3] in [0, 1], by windows in float64: list of [c, h', w']."""
+    x = 2.0 * np.moveaxis(image.astype(np.float64), -1, 0) - 1.0
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    x = (x - shift[:, None, None]) / scale[:, None, None]
+    taps, windows = [], np.lib.stride_tricks.sliding_window_view
+    for index, stride, padding in ((0, 4, 2), (3, 1, 2), (6, 1, 1), (8, 1, 1), (10, 1, 1)):
+        if index in (3, 6):
+            x = windows(x, (3, 3), (1, 2))[:, ::2, ::2].max((-2, -1))
+        kernel, bias = tensors[f"features.{index}.weight"], tensors[f"features.{index}.bias"]
+        x = np.pad(x, ((0, 0), (padding,) * 2, (padding,) * 2))
+        seen = windows(x, kernel.shape[2:], (1, 2))[:, ::stride, ::stride]
+        x = np.maximum(np.einsum("chwij,ocij->ohw", seen, kernel) + bias[:, None, None], 0.0)
+        taps.append(x)
+    return taps
+
+
+def test_distance_is_that_of_plain_numpy_on_random_weights(alex):
+    """The definition without PyTorch: range, shift and scale of the input, unit features, squared, heads, means."""
+    a, b = images(1)
+    total = 0.0
+    for k, (f, g) in enumerate(zip(numpy_alex(alex, a[0]), numpy_alex(alex, b[0]))):
+        f, g = (y / (np.linalg.norm(y, axis=0) + 1e-10) for y in (f, g))
+        total += np.mean(
+            np.einsum("c,chw->hw", alex[f"lin{k}.model.1.weight"][0, :, 0, 0], (f - g) ** 2)
+        )
+    found = learned.lpips(learned.from_official("alex", alex), a, b, trunk="alex")
+    np.testing.assert_allclose(found[0], total, rtol=1e-5)
+
+
 def test_layers_are_the_official_ones():
     vgg = [c.key for c in learned.TRUNKS["vgg"].convs]
     assert vgg == [f"features.{i}" for i in (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)]

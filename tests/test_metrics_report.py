@@ -41,7 +41,22 @@ def test_wins_know_what_better_means():
         entry("b", generated={"sharpness_ratio": 0.5}, plane={"sharpness_ratio": 0.8}),
     ]
     assert report.paired_difference(scenes, "generated", "plane", "sharpness_ratio")["wins"] == 0.5
-    assert report.goodness("lpips_vgg", 0.1) > report.goodness("lpips_vgg", 0.2)
+    for error in (
+        "gmsd",
+        "lpips_vgg",
+        "lpips_alex",
+        "ape_t",
+        "ape_r",
+        "ape_r_rot",
+        "rpe_t",
+        "rpe_r",
+    ):
+        assert report.goodness(error, 0.1) > report.goodness(error, 0.2), error
+    for good in ("psnr", "ssim", "ssim_zero_pad", "gradient_psnr", "tsed"):
+        assert report.goodness(good, 0.1) < report.goodness(good, 0.2), good
+    # a ratio: half the detail is as bad as twice as much, worse than 1.6 times
+    assert report.goodness("sharpness_ratio", 0.5) == report.goodness("sharpness_ratio", 2.0)
+    assert report.goodness("sharpness_ratio", 0.5) < report.goodness("sharpness_ratio", 1.6)
 
 
 def test_bootstrap_covers_the_true_mean_as_often_as_it_says():

@@ -17,7 +17,7 @@ from roge_jax.core.lora import attach
 from roge_jax.core.params import flatten, unflatten
 from roge_jax.data.views import make_sample
 from roge_jax.training import diagnose
-from roge_jax.video import dit, flow
+from roge_jax.video import dit, flow, vae
 
 # The gradient of the whole model takes long to compile. The VAE only encodes here and chunks of views only bound
 # memory; both have tests of their own.
@@ -158,6 +158,43 @@ def test_what_the_paper_trains():
     assert not [path for path in adapted if "_img" in path]
 
 
+def test_pictures_reach_the_vae_between_minus_one_and_one():
+    """Photos one by one, videos as a whole, and back: black is -1, white is 1."""
+    rgb = jnp.asarray(np.random.default_rng(2).random((5, 16, 24, 3)), jnp.float32)
+    p, cfg = whole(), CONFIG.vae
+    video = model.encode_targets(p, rgb, config=CONFIG)
+    np.testing.assert_allclose(video, vae.encode(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5)
+    photos = model.encode_contexts(p, rgb, config=CONFIG)
+    np.testing.assert_allclose(photos, vae.encode_frames(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5)
+    shown = model.decode_video(p, video, config=CONFIG)
+    raw = np.asarray(vae.decode(p["vae"], video, cfg=cfg))
+    np.testing.assert_allclose(shown, np.clip((raw + 1) / 2, 0, 1), atol=1e-5)
+    # A first frame is coded as a photo of it.
+    np.testing.assert_allclose(video[0], photos[0], atol=1e-5)
+
+
+def test_the_reconstruction_does_not_know_the_size_of_the_video():
+    """Pictures and cameras at its own size: the same tokens, rays and picture whatever size is generated."""
+    small = dataclasses.replace(CONFIG, recon_height=16, recon_width=32)
+    alone = dataclasses.replace(small, height=16, width=32)
+    views = {k: jnp.asarray(v) for k, v in sample(5).items() if k != "target_rgb"}
+    views["context_recon"] = model.resized(views["context_rgb"], 16, 32)
+    scale = jnp.asarray([32 / CONFIG.width, 16 / CONFIG.height, 1.0])[None, :, None]
+    own = views | {"context_rgb": views["context_recon"], "K": views["K"] * scale}
+
+    @functools.partial(jax.jit, static_argnames="config")
+    def seen(p, views, config):
+        tokens = model.reconstruct(p, views, config=config)
+        return tokens, model.query_rays(p, tokens, views, config=config)
+
+    for got, want in zip(seen(whole(), views, small), seen(whole(), own, alone)):
+        assert rel_l2(got, want) < ROUNDING
+    del views["context_recon"]  # resized where nothing sharper is given
+    want = seen(whole(), own, alone)[0]
+    assert rel_l2(seen(whole(), views, small)[0], want) < ROUNDING
+    assert rel_l2(seen(whole(), own | {"K": views["K"]}, alone)[0], want) > 1e-2
+
+
 # What the flow term ignores.
 
 
@@ -197,6 +234,26 @@ def test_the_loss_ignores_context_slots():
     error = np.square(v[None] - (noise - np.asarray(x0, np.float64)))[M:].mean()
     weight = flow.loss_weight(sigma, weighting=CONFIG.flow.weighting, shift=CONFIG.flow.shift)
     np.testing.assert_allclose(got, float(weight) * error, rtol=1e-5)
+
+
+def test_the_noise_levels_of_a_step_are_one_from_each_part(monkeypatch):
+    """The mean over 40 levels hardly varies between keys; that of 40 free draws would by 0.04."""
+
+    def level(params, x0, cond, key, *, config, contexts, part=None):
+        return flow.training_sigma(key, shift=config.flow.shift, part=part)
+
+    monkeypatch.setattr(model, "flow_matching", level)
+    options = {"config": CONFIG, "contexts": M}
+    means = [
+        model.mean_flow_matching({}, None, None, jax.random.key(i), draws=40, **options)
+        for i in range(8)
+    ]
+    assert 0.0 < np.std(means) < 0.01
+    ones = [
+        float(model.mean_flow_matching({}, None, None, jax.random.key(i), draws=1, **options))
+        for i in range(8)
+    ]
+    assert np.std(ones) > 0.05
 
 
 # Symmetry of the context slots.

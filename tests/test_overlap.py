@@ -5,6 +5,7 @@ import pytest
 
 from roge_jax import sampling
 from roge_jax.config import preset
+from roge_jax.data import overlap
 from roge_jax.data.overlap import select_overlapping
 from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.scene import Scene, select_context
@@ -38,6 +39,63 @@ def test_photos_hang_together(rooms):
     assert max(near) - min(near) >= 3  # far apart as long as they share something
     assert sampling.context_ids("3", rooms, config) == near
     assert len(sampling.context_ids(None, rooms, config)) == 6
+
+
+@pytest.fixture
+def row(monkeypatch):
+    """choose(m, areas): from 7 views a step apart in a row, where `areas(i, j)` are the shares of both pictures that the
+    matches of views i and j span; (the views, the pairs that were looked at)."""
+    side = 100
+
+    def square(area):
+        return np.sqrt(area) * side * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+
+    def choose(m, areas):
+        asked = []
+
+        def matches(one, other, height, width):
+            asked.append((one[0], other[0]))
+            return tuple(square(area) for area in areas(one[0], other[0]))
+
+        monkeypatch.setattr(overlap, "matches_inside", matches)
+        return select_overlapping(scene, m, side, side), asked
+
+    monkeypatch.setattr(overlap, "shrink", lambda image, K: (image, K))
+    monkeypatch.setattr(overlap, "features", lambda image: round(10 * float(image.mean())))
+    images = [np.full((4, 4, 3), i / 10) for i in range(7)]
+    c2w = np.tile(np.eye(4), (7, 1, 1))
+    c2w[:, 0, 3] = np.arange(7)
+    cameras = Cameras(np.tile(np.eye(3), (7, 1, 1)), c2w)
+    scene = Scene(images, cameras, tuple("abcdefg"), "row")
+    return choose
+
+
+def test_a_photo_is_held_against_the_nearest_of_those_chosen(row):
+    """Views two steps apart share enough: from the middle outwards, each hangs on its neighbour, not on the first."""
+    found, asked = row(4, lambda i, j: (0.3, 0.3) if abs(i - j) <= 2 else (0.2, 0.2))
+    assert found == [0, 1, 3, 5]
+    assert (0, 3) in asked and (
+        0,
+        1,
+    ) in asked  # too far from the first, and near enough to the second
+
+
+def test_what_is_shared_must_be_a_quarter_of_both_pictures(row):
+    """Views three steps apart fill one picture and a corner of the other: only closer ones share something."""
+    for areas in ((0.9, 0.2), (0.2, 0.9)):
+        found, _ = row(2, lambda i, j, areas=areas: (0.3, 0.3) if abs(i - j) == 1 else areas)
+        assert found in ([2, 3], [3, 4])
+
+
+def test_after_a_miss_the_next_try_is_a_quarter_closer(row):
+    found, asked = row(2, lambda i, j: (0.1, 0.1))
+    assert [abs(i - j) for i, j in asked] == [
+        3,
+        2,
+        1,
+        1,
+    ]  # in the end the nearest, whatever it shares
+    assert found == [3, 4]
 
 
 def test_where_nothing_is_shared_the_nearest_is_taken(rooms):

@@ -3,6 +3,7 @@
 import io
 import json
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -90,6 +91,7 @@ def test_exif_orientation(tmp_path, orientation):
         )
         files.save(other / "images" / "0000.png", stored, exif=exif)
         scene = load_scene(other)
+        assert scene.sizes == [(HEIGHT, WIDTH)]  # before pixels are decoded
         np.testing.assert_allclose(scene.images[0] * 255, upright, atol=1e-4)
         np.testing.assert_allclose(scene.cameras.K, truth.K, atol=1e-9)
         np.testing.assert_allclose(scene.cameras.c2w, truth.c2w, atol=1e-9)
@@ -259,3 +261,16 @@ def test_damaged_photos(tmp_path):
 def test_resize_keeps_what_fits():
     image = picture(0)
     np.testing.assert_array_equal(resize(image, HEIGHT, WIDTH), image.astype(np.float32) / 255)
+
+
+@pytest.mark.parametrize("filter_of", ["opencv", "jax"])
+def test_shrinking_averages_what_it_leaves_out(monkeypatch, filter_of):
+    """Stripes finer than the new pixels become grey, at any factor: no pattern that was not there."""
+    if filter_of == "jax":
+        monkeypatch.setitem(sys.modules, "cv2", None)
+    y, x = np.mgrid[:60, :80] % 2
+    for stripes in (x, y, x ^ y):
+        image = np.repeat(stripes[..., None], 3, -1).astype(np.uint8) * 255
+        for size in ((20, 27), (15, 20), (7, 16)):
+            inner = resize(image, *size)[1:-1, 1:-1]
+            assert np.abs(inner - 0.5).max() < 0.17

@@ -12,13 +12,13 @@ import pytest
 from scene_files import nerfstudio, truth
 
 import roge_jax as rj
-from roge_jax import checkpoint, cost, entry, model, sample, sampling
+from roge_jax import checkpoint, cost, entry, model, programs, sample, sampling
 from roge_jax.config import preset
 from roge_jax.data import coverage
 from roge_jax.data.scene import load_scene, select_context
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import Cameras
-from roge_jax.geometry.trajectories import make_path
+from roge_jax.geometry.trajectories import focus_distance, make_path
 from roge_jax.planning import proxies, table
 from roge_jax.planning.options import full_choices, list_options
 from roge_jax.recon.ray_scene import attend, merge_scene
@@ -350,6 +350,21 @@ def test_coverage_knows_no_unit_and_no_frame(photos, path):
     assert here.min() >= 0 and here.max() <= 1 and here.mean() > 0.05
 
 
+def test_photos_from_further_away_are_worth_less_and_from_closer_no_more():
+    """Along one line of sight a photo is worth the target's distance over its own, at most 1."""
+    K = np.array([[1e5, 0, 32], [0, 1e5, 18], [0, 0, 1]])  # a pencil of rays: no angle between them
+    c2w = np.tile(np.eye(4), (3, 1, 1))
+    c2w[:, 2, 3] = 0.0, -1.0, 0.5
+    photos = Cameras(np.tile(K, (3, 1, 1)), c2w)
+    worth = coverage.coverage(photos, photos[:1], 36, 64)
+    depths = focus_distance(photos) * np.array(coverage.DEPTHS)
+    assert depths[0] > 0.5  # all in front of every photo
+    expected = np.tile(depths / (depths + 1.0), worth.shape[1] // len(depths))
+    np.testing.assert_allclose(worth[1], expected, rtol=1e-3)
+    np.testing.assert_allclose(worth[[0]], 1.0, rtol=1e-3)
+    np.testing.assert_allclose(worth[2][worth[2] > 0], 1.0, rtol=2e-2)
+
+
 def test_the_window_that_is_seen_best_is_the_one_not_generated(photos):
     """The photos' own views against views turned away from all that they show."""
     away = photos.cameras.c2w.copy()
@@ -373,10 +388,32 @@ def test_one_photo_can_be_planned_for(make, photos):
 # ---- what a reduced run computes ------------------------------------------------------------------
 
 
-def test_targets_keep_their_noise_when_photos_are_dropped():
-    full = sampling.window_noise(3, 0, 4, CONFIG)
-    fewer = full[-CONFIG.slots(2) :]
-    np.testing.assert_array_equal(fewer[2:], full[4:])
+@pytest.mark.parametrize("long", ["chain", "independent"])
+def test_targets_keep_their_noise_when_photos_are_dropped(photos, path, monkeypatch, long):
+    """In every window: what is generated differs by what is seen, not by another draw."""
+    drawn = []
+
+    def without_network(params, views, config, slots):
+        video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
+
+        def velocity(params, prepared, noise, x, sigma):
+            drawn.append((np.asarray(noise), config.slots(0)))
+            return 0 * x
+
+        shown = types.SimpleNamespace(shown=video, detail=None)
+        return programs.Programs(lambda *_: shown, velocity, lambda *_: video)
+
+    monkeypatch.setattr(programs, "for_window", without_network)
+    full = full_choices(photos, CONFIG, path, SETTINGS)
+    found = []
+    for kept in ((0, 1, 2, 3), (1, 3)):
+        drawn.clear()
+        choices = dataclasses.replace(full, photos=kept, steps=1)
+        run({}, photos, path, choices, {}, long=long)
+        found.append([noise[-slots:] for noise, slots in drawn])
+    assert len(found[0]) == len(found[1]) == 2
+    np.testing.assert_array_equal(*found)
+    assert np.any(found[0][0] != found[0][1])
 
 
 def test_every_knob_changes_the_run_as_it_says(weights, photos, path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,12 +10,12 @@ import numpy as np
 import pytest
 from scene_files import nerfstudio, truth
 
-from roge_jax import checkpoint, entry, inputs, model, sample, sampling, video_io
+from roge_jax import checkpoint, entry, inputs, model, programs, sample, sampling, video_io
 from roge_jax.config import preset
 from roge_jax.data.scene import cameras_at, load_scene, open_scene
 from roge_jax.data.views import make_sample
 from roge_jax.errors import UserError
-from roge_jax.geometry.cameras import Cameras, normalise
+from roge_jax.geometry.cameras import RULES, Cameras, concatenate, normalise
 from roge_jax.geometry.trajectories import make_path
 
 CONFIG = preset("tiny")
@@ -203,6 +204,73 @@ def test_chained_windows_share_one_compilation_and_remember(weights, photos):
     assert np.abs(result.preview[WINDOW:] - other.preview[WINDOW:]).max() > 1e-4
 
 
+def numbered(seen):
+    """In place of `programs.for_window`: what windows see is added to `seen`, and frame i gets the level i / 100.
+    Nothing is compiled."""
+
+    def for_window(params, views, config, slots):
+        size = (config.frames, config.height, config.width, 3)
+        recon = (config.frames, config.recon_height, config.recon_width, 3)
+
+        def prepare(params, views):
+            seen.append({name: np.asarray(x) for name, x in views.items()})
+            return SimpleNamespace(shown=np.zeros(recon, np.float32), detail=None)
+
+        def decode(params, x0, detail):
+            levels = (config.frames * (len(seen) - 1) + np.arange(config.frames)) / 100
+            return np.broadcast_to(levels[:, None, None, None], size).astype(np.float32)
+
+        return programs.Programs(prepare, lambda p, ready, noise, x, sigma: 0 * x, decode)
+
+    return for_window
+
+
+@pytest.mark.parametrize(("most", "made_before"), [(4, 1), (6, 2)], ids=["photos go", "all stay"])
+def test_pictures_of_chained_windows_keep_their_cameras(place, monkeypatch, most, made_before):
+    """Photos and frames already made come with their own pose, lens and picture at both sizes, in one frame and unit."""
+    config = dataclasses.replace(CONFIG, max_context=most, recon_height=64, recon_width=96)
+    photos = sampling.read_photos(load_scene(place / "scene"), [2, 0, 3, 1], config)
+    path = make_path("orbit", photos.cameras, 3 * WINDOW, degrees=25)
+    seen = []
+    monkeypatch.setattr(programs, "for_window", numbered(seen))
+    result = sampling.sample({}, config, photos, path, SETTINGS)
+    assert [len(window["generated"]) for window in result.windows] == [0, made_before, made_before]
+    assert [len(window["photos"]) for window in result.windows][1:] == [most - made_before] * 2
+    for views, window in zip(seen, result.windows, strict=True):
+        kept, made = [photos.ids.index(i) for i in window["photos"]], window["generated"]
+        first, last = window["frames"]
+        assert all(i < first for i in made)
+        for name, pictures in (("context_rgb", photos.images), ("context_recon", photos.recon)):
+            np.testing.assert_array_equal(views[name][: len(kept)], pictures[kept])
+            levels = views[name][len(kept) :].mean((1, 2, 3))
+            np.testing.assert_allclose(levels, np.array(made) / 100, atol=1e-6)
+        parts = photos.cameras[kept], path[made], path[first : last + 1]
+        every = result.normalisation.apply(concatenate(*parts))
+        np.testing.assert_allclose(views["c2w"], every.c2w, atol=1e-5)
+        np.testing.assert_allclose(views["K"], every.K, rtol=1e-5)
+        contexts = len(kept) + len(made)
+        np.testing.assert_allclose(views["vectors"][:, :3], every.centres[:contexts], atol=1e-5)
+
+
+@pytest.mark.parametrize("long", ["chain", "independent"])
+def test_a_scale_of_the_user_divides_all_positions(photos, monkeypatch, long):
+    seen, plain = [], []
+    path = make_path("orbit", photos.cameras, 2 * WINDOW)
+    settings = sampling.Settings(steps=1, solver="euler", long=long)
+    for found, scale in ((plain, None), (seen, 7.0)):
+        monkeypatch.setattr(programs, "for_window", numbered(found))
+        settings = dataclasses.replace(settings, scale=scale)
+        result = sampling.sample({}, CONFIG, photos, path, settings)
+    assert result.normalisation.divisor == 7.0
+    reach = result.normalisation.context_reach
+    for views, others in zip(seen, plain, strict=True):
+        ratio = RULES[CONFIG.scale_rule] * reach / 7.0
+        np.testing.assert_allclose(
+            views["c2w"][:, :3, 3], ratio * others["c2w"][:, :3, 3], atol=1e-5
+        )
+        np.testing.assert_allclose(views["vectors"][:, 9], reach / 7.0, rtol=1e-5)
+
+
 def test_program_agrees_with_the_model_file(weights, photos):
     """One window of the sampler is `model.prepare`, `generate` and `decode_video` on the same noise."""
     path = make_path("orbit", photos.cameras, WINDOW)
@@ -312,6 +380,13 @@ class TestChaining:
         )
         assert kept == [0]
         assert chosen[0] == 10 and chosen[1] in (0, 1)
+
+    def test_the_second_frame_shows_what_the_first_one_does_not(self):
+        """Most views ahead are by the last frame, which has them already: the other one is for the rest."""
+        made = self.cameras(np.linspace(0, 10, 11))
+        ahead = self.cameras([10.0, 10.0, 10.0, 0.0])
+        _, chosen = sampling.chain_views(self.cameras([50.0]), made, ahead, self.config(6))
+        assert chosen == [10, 0]
 
     def test_windows_cover_the_path_once(self):
         for frames in (1, 5, 6, 12, 15):
@@ -429,6 +504,13 @@ def test_field_of_view_and_size(place, photos):
     )
 
 
+def test_the_reconstruction_keeps_its_share_of_another_size():
+    config = inputs.model_config(
+        arguments("--checkpoint", "paper", "--size", "96x160"), weights=False
+    )
+    assert (config.recon_height, config.recon_width) == (144, 240)  # 1.5 times, as the paper's
+
+
 def test_path_files_are_followed(tmp_path, photos):
     from roge_jax.geometry.paths import save_path
 
@@ -460,6 +542,18 @@ def test_photos_are_chosen_for_a_path_that_is_known(tmp_path, place):
         assert len(path) == 2
         _, photos, _ = inputs.read_inputs(arguments(*words, "--context", "3,0"), CONFIG, settings)
         assert photos.ids == (3, 0)
+
+
+def test_a_path_without_a_lens_is_judged_by_that_of_the_video(tmp_path, place, monkeypatch):
+    """Photos are chosen for what the video will show: in its pixels, not in those of the photos."""
+    poses = [{"pose": pose.tolist()} for pose in load_scene(place / "scene").cameras.c2w[:2]]
+    (tmp_path / "path.json").write_text(json.dumps({"convention": "opencv", "frames": poses}))
+    asked = []
+    monkeypatch.setattr(sampling, "context_ids", lambda *a: asked.append(a[-1]) or [0, 1])
+    words = ["--scene", place / "scene", "--trajectory", tmp_path / "path.json"]
+    path = inputs.read_inputs(arguments(*words), CONFIG, SETTINGS.of(CONFIG))[2]
+    np.testing.assert_allclose(asked[0].K, path.K)
+    np.testing.assert_allclose(asked[0].c2w, path.c2w)
 
 
 def test_convention_reaches_the_reader(place, monkeypatch):

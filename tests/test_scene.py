@@ -143,6 +143,11 @@ def test_straightened_photos_are_pinhole_photos(model):
     assert np.abs(new_K - K).max() > 0.5
 
 
+def test_without_distortion_there_is_nothing_to_straighten():
+    K = np.array([[60.0, 0, 41.3], [0, 62.0, 22.9], [0, 0, 1]])
+    np.testing.assert_allclose(ideal_K(K, Lens("opencv", (0.0,) * 4), (48, 80)), K, atol=1e-4)
+
+
 def test_distorted_scene_is_straightened(tmp_path):
     coefficients = {"k1": -0.2, "k2": 0.05, "p1": 0.004, "p2": -0.003}
     files.nerfstudio(tmp_path, CAMERAS, camera_model="OPENCV", **coefficients)
@@ -336,6 +341,9 @@ def test_motorcycle_calibration():
     do not if the baseline or the shift of the principal point is reversed."""
     scene = load_scene("motorcycle")
     assert scene.sizes == [(500, 741)] * 2
+    # The published principal point is that of whole-numbered pixel centres at four times the size.
+    full = 4 * np.array([[311.193, 254.877], [311.193 + 31.086, 254.877]])
+    np.testing.assert_allclose(scene.cameras.K[:, :2, 2], (full + 0.5) / 4, atol=1e-9)
     depth = scene.depths[0].astype(np.float64)
     known = np.isfinite(depth)
     assert known.mean() > 0.8 and 1.0 < np.nanmedian(depth) < 10.0  # a motorcycle, in metres
@@ -415,6 +423,9 @@ def test_select_context_covers_the_scene():
         select_context(arc, 2, first=5, among=[1, 2])
     turned = looking_at_origin(5)
     turned.c2w[:, :3, 3] = 1.0  # a tripod: the angle alone decides
+    assert select_context(turned, 3) == [0, 2, 4]
+    # also where its places differ by the rounding of map coordinates
+    turned.c2w[:, :3, 3] = 5e6 + 1e-9 * np.array([0, 9, 1, 8, 2])[:, None]
     assert select_context(turned, 3) == [0, 2, 4]
 
 

@@ -19,6 +19,7 @@ from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.folders import BLOCK_BYTES, BLOCKS, fingerprint
 from roge_jax.training import diagnose, loop, stages
+from roge_jax.training import run as training_run
 from roge_jax.training.start import hold_settings
 
 
@@ -146,6 +147,70 @@ def test_the_error_of_the_preview_is_measured_and_the_head_starts_again(common):
     np.testing.assert_allclose(
         np.sqrt(np.square(error).mean(0)), found.fusion.preview_std, rtol=2e-3
     )
+
+
+def test_the_model_that_is_saved_is_the_average(common, cheap, tmp_path, monkeypatch):
+    kept, train = {}, loop.train
+
+    def averaged(*arguments, **more):
+        state = train(*arguments, **more)
+        kept.update(flatten(jax.tree.map(lambda x: np.asarray(x) + 0.25, state["params"])))
+        return state | {"ema": unflatten(kept)}
+
+    monkeypatch.setattr(loop, "train", averaged)
+    run(*common, "--stage", "prior", "--steps", 1, "--batch", 1, "--out", tmp_path)
+    found = flatten(load_model(tmp_path / "prior/model")[0])
+    assert kept
+    for path, leaf in kept.items():
+        np.testing.assert_array_equal(found[path], leaf, err_msg=path)
+
+
+def test_a_preview_is_measured_again_once_the_latents_moved(monkeypatch):
+    """Its error is one of latents: a VAE that encodes otherwise forgets it, one that decodes otherwise does not."""
+    cfg = config.preset("tiny")
+    spread = tuple(np.linspace(0.1, 0.4, cfg.vae.latent))
+    cfg = dataclasses.replace(
+        cfg, fusion=dataclasses.replace(cfg.fusion, preview=True, preview_std=spread)
+    )
+    monkeypatch.setattr(stages, "measure_latents", lambda params, source, config, seed: config)
+    found = {}
+    for name, leaf in (("vae_longer", "vae/encoder/x"), ("vae_decoder", "vae/decoder/x")):
+        stage = stages.find_stage(stages.mini_stages(), name)
+        tree = unflatten({leaf: jnp.zeros(())})
+        _, measured, _ = training_run._measured(tree, tree, stage, cfg, None, 0)
+        found[name] = measured.fusion.preview_std
+    assert found == {"vae_longer": None, "vae_decoder": spread}
+
+
+def test_held_out_scenes_are_scored_undisturbed(monkeypatch):
+    """However a stage draws and alters its samples: the same views, pictures and cameras are scored."""
+    from roge_jax.data import procedural
+
+    def sequence(seed, frames, height, width):
+        rng = np.random.default_rng(seed)
+        c2w = np.tile(np.eye(4), (frames, 1, 1))
+        c2w[:, :3, 3] = rng.standard_normal((frames, 3))
+        K = np.tile(np.diag([40.0, 40.0, 1.0]), (frames, 1, 1))
+        rgb = rng.integers(0, 256, (frames, height, width, 3), dtype=np.uint8)
+        return {"rgb": rgb, "K": K, "c2w": c2w}
+
+    def objective(trainable, frozen, batch, key):
+        told = {name: x.mean() + x.std() for name, x in batch.items()}
+        return told["context_rgb"], told
+
+    monkeypatch.setattr(procedural, "sample_sequence", sequence)
+    cfg = config.preset("tiny")
+    stage = stages.find_stage(stages.mini_stages(frames=cfg.frames), "lookup")
+    scores = []
+    for change in (
+        {"augment": True, "near": 1.0, "faults": 1.0},
+        {"augment": False, "near": 0.0, "faults": 0.0},
+    ):
+        views = dataclasses.replace(stage.views, **change)
+        one = dataclasses.replace(stage, views=views, batch=2)
+        scores.append(stages.held_out(objective, {}, one, cfg, scenes=4)({}))
+    assert scores[0] == scores[1]
+    assert set(scores[0]) >= {"held_loss", "held_K", "held_c2w", "held_target_rgb"}
 
 
 def test_a_generator_is_trained_about_the_preview_once(common, tmp_path, monkeypatch):

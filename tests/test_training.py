@@ -323,17 +323,22 @@ def test_an_evaluation_that_is_not_finite_stops_the_run(tmp_path):
     assert sorted(int(p.name) for p in (tmp_path / "checkpoints").iterdir()) == [10]
 
 
-def test_the_averaged_parameters_are_evaluated(tmp_path):
-    def total(p):
-        return {"held_sum": float(jnp.sum(p["layer"]["kernel"]))}
+@pytest.mark.parametrize("ema", [0.9, 0.0])
+def test_what_is_evaluated_is_what_is_saved(tmp_path, ema):
+    """The average where there is one, as the model that comes out of the run."""
+    seen = []
 
-    state = run(tmp_path, 10, evaluate=total, evaluate_every=5)
-    found = [row["held_sum"] for row in log_of(tmp_path) if "held_sum" in row]
-    assert len(found) == 3 and found[0] == total(start())["held_sum"]
-    assert found[-1] == total(state["ema"])["held_sum"] != total(state["params"])["held_sum"]
-    plain = dataclasses.replace(OPTIM, ema=0.0)
-    state = run(tmp_path / "plain", 10, optim=plain, evaluate=total, evaluate_every=10)
-    assert log_of(tmp_path / "plain")[-1]["held_sum"] == total(state["params"])["held_sum"]
+    def evaluate(p):
+        seen.append(jax.tree.map(np.array, p))
+        return {"held_loss": 1.0}
+
+    optim = dataclasses.replace(OPTIM, ema=ema)
+    state = run(tmp_path, 20, optim=optim, evaluate=evaluate, evaluate_every=10)
+    assert len(seen) == 3
+    assert_same(seen[-1], state["ema" if ema else "params"])
+    assert np.any(
+        seen[-1]["layer"]["kernel"] != np.asarray(state["params"]["layer"]["kernel"])
+    ) == bool(ema)
 
 
 def test_the_held_out_loss_is_told_from_the_first_to_the_last(tmp_path):
@@ -586,12 +591,45 @@ def test_accumulated_steps_equal_one_step_on_the_mean_gradient():
         np.testing.assert_allclose(value, flatten(want)[path], rtol=1e-5)
 
 
+def test_the_rate_of_accumulated_steps_falls_as_the_updates_end():
+    """20 steps of two that make 10 updates: the sizes of 10 steps, warm-up and decay included."""
+    p = start()
+    g = jax.tree.map(jnp.ones_like, p)
+
+    def sizes(accumulate):
+        cfg = OptimConfig(
+            learning_rate=0.1, warmup=2, decay=0.5, weight_decay=0.0, accumulate=accumulate
+        )
+        optimiser = make_optimiser(cfg, SPECS, 10 * accumulate)
+        state, found = optimiser.init(p), []
+        for _ in range(10 * accumulate):
+            updates, state = optimiser.update(g, state, p)
+            found.append(abs(float(updates["layer"]["bias"][0])))
+        return [size for size in found if size > 0]
+
+    plain = sizes(1)
+    assert len(plain) == 10 and plain[-1] < 0.3 * max(plain)
+    np.testing.assert_allclose(sizes(2), plain, rtol=1e-4)
+
+
 def test_the_average_starts_fast_and_slows_down():
     average, p = {"x": jnp.zeros(())}, {"x": jnp.ones(())}
     assert float(ema_update(average, p, 0.99, jnp.asarray(0))["x"]) == pytest.approx(0.9)
     assert float(ema_update(average, p, 0.99, jnp.asarray(10**6))["x"]) == pytest.approx(
         0.01, rel=1e-4
     )
+
+
+def test_the_average_is_over_the_parameters_after_each_step():
+    optimiser = make_optimiser(OPTIM, SPECS, 10)
+    step = jax.jit(training.make_step(objective, optimiser, OPTIM))
+    state = training.initial_state(start(), optimiser, OPTIM)
+    average = np.asarray(state["params"]["layer"]["kernel"])
+    for i in range(3):
+        state, _ = step(state, {}, batch_of(i), jax.random.key(i))
+        rate = min(OPTIM.ema, (1 + i) / (10 + i))
+        average = rate * average + (1 - rate) * np.asarray(state["params"]["layer"]["kernel"])
+        np.testing.assert_allclose(state["ema"]["layer"]["kernel"], average, rtol=1e-6)
 
 
 def test_muon_takes_the_hidden_matrices_and_nothing_else():

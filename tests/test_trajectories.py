@@ -125,6 +125,13 @@ def test_orbit_keeps_distance_and_aim(degrees):
     np.testing.assert_allclose(heights, heights[0], atol=1e-6)
     if degrees == 360.0:
         np.testing.assert_allclose(path.c2w[-1], path.c2w[0], atol=1e-9)
+    else:  # half of the arc to either side, first to one
+        right = (path.centres - path.centres[0]) @ CONTEXT.c2w[0, :3, 0]
+        assert abs(right[4] + right[12]) < 1e-6
+        ends = path.centres[[4, 12]] - point
+        cosine = ends[0] @ ends[1] / np.prod(np.linalg.norm(ends, axis=-1))
+        level = 1.0 - (ends[0] @ world_up(CONTEXT) / 4.0) ** 2  # on a cone, unless it is level
+        assert np.degrees(np.arccos((cosine - 1.0) / level + 1.0)) == pytest.approx(degrees)
 
 
 @pytest.mark.parametrize("name", ["spiral", "lemniscate"])
@@ -141,6 +148,7 @@ def test_zoom_and_dolly_zoom():
     """Zooming changes only the focal length; a dolly zoom keeps the size of what is in focus."""
     zoomed = make_path("zoom-in", CONTEXT, 5, factor=2.0)
     np.testing.assert_allclose(zoomed.K[-1, [0, 1], [0, 1]], 80.0)
+    np.testing.assert_allclose(zoomed.K[1:, 0, 0] / zoomed.K[:-1, 0, 0], 2.0**0.25)  # evenly
     np.testing.assert_allclose(zoomed.K[:, :2, 2], np.tile(CONTEXT.K[0, :2, 2], (5, 1)))
     for name in ("dolly-zoom-in", "dolly-zoom-out"):
         path = make_path(name, CONTEXT, 5, focus=3.0)
@@ -171,6 +179,9 @@ def test_world_up():
     np.testing.assert_allclose(world_up(CONTEXT), [0, 0, 1], atol=1e-9)
     single = world_up(CONTEXT[0])
     np.testing.assert_allclose(single, -CONTEXT.c2w[0, :3, 1], atol=1e-12)
+    for seed in range(6):  # an eigenvector has no sign of its own
+        world = random_rigid(np.random.default_rng(seed))
+        np.testing.assert_allclose(world_up(moved(CONTEXT, world)), world[:3, 2], atol=1e-9)
 
 
 @few

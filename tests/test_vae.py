@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from parity import key_listing, load_case, rel_l2, rule_weights
 
-from roge_jax.config import VAEConfig
+from roge_jax.config import VAEConfig, preset
 from roge_jax.core.params import abstract, check, count, flatten, unflatten
 from roge_jax.errors import UserError
+from roge_jax.training import stages
 from roge_jax.video import vae, vae_training
 from roge_jax.weights import mapping, wan_vae
 
@@ -113,6 +114,20 @@ def test_chunks_equal_the_whole(small):
     assert rel_l2(chunked, encode(params, video)) <= 1e-5
     chunked = jax.jit(functools.partial(vae.decode_chunked, cfg=SMALL))(params, latents)
     assert rel_l2(chunked, decode(params, latents)) <= 1e-5
+
+
+def test_a_clip_goes_in_chunks_as_soon_as_its_largest_map_is_too_large(monkeypatch):
+    """The limit counts frames and pixels of the video, whichever way it goes."""
+    frames, height, width = 13, 16, 24
+    video = jnp.zeros((frames, height, width, 3))
+    latents = jnp.zeros((4, height // 8, width // 8, SMALL.latent))
+    largest = 4.0 * frames * height * width * SMALL.base  # float32
+    for name in ("encode", "encode_chunked", "decode", "decode_chunked"):
+        monkeypatch.setattr(vae, name, lambda p, x, *, cfg, name=name: name)
+    for limit, ending in ((largest, ""), (largest - 1, "_chunked")):
+        monkeypatch.setattr(vae, "SINGLE_PASS_BYTES", limit)
+        assert vae.encode_any({}, video, cfg=SMALL) == "encode" + ending
+        assert vae.decode_any({}, latents, cfg=SMALL) == "decode" + ending
 
 
 def test_one_frame_equals_the_first_of_many(small):
@@ -325,6 +340,34 @@ def test_loss_is_its_definition_and_images_leave_older_taps_alone(small, passthr
             assert not np.any(grad), path
         elif grad.ndim == 5:
             assert np.any(grad[-1]) and not np.any(grad[:-1]), path
+
+
+def test_stages_show_the_vae_pictures_between_minus_one_and_one(monkeypatch):
+    """Black is -1 and white is 1 where it is trained and where the spread of its latents is measured."""
+
+    def loss(p, video, key, *, cfg):
+        return video.mean(), {"low": video.min(), "high": video.max()}
+
+    monkeypatch.setattr(vae_training, "vae_loss", loss)
+    config = preset("tiny")
+    frames = config.frames
+    clips = jnp.concatenate([jnp.zeros((1, frames, 8, 8, 3)), jnp.ones((1, frames, 8, 8, 3))])
+    p = {"vae": {"x": jnp.zeros(())}}
+    value, terms = stages.vae_objective(
+        p, {}, {"target_rgb": clips}, jax.random.key(0), config=config, stage=None
+    )
+    assert (float(value), float(terms["low"]), float(terms["high"])) == (0.0, 0.0, 0.0)  # -1 and 1
+
+    def moments(p, video, *, cfg):
+        return jnp.broadcast_to(video[:1, :1, :1, :1], (1, 1, 1, 2 * cfg.latent))
+
+    def batch(source, stage, config, seed, i):
+        return {"target_rgb": clips[i % 2][None]}
+
+    monkeypatch.setattr(vae, "encode_moments", moments)
+    monkeypatch.setattr(stages, "stage_batch", batch)
+    measured = stages.measure_latents(p, None, config, 0, clips=4).vae
+    assert set(measured.latent_mean) == {0.0} and set(measured.latent_std) == {1.0}
 
 
 def test_block_colours_are_means_over_the_pixels_and_frames_of_a_latent():

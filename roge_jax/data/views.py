@@ -48,8 +48,8 @@ def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):
     around = np.setdiff1d(np.arange(frames), window)
     if rng.random() < cfg.outside and len(around) >= m:
         contexts = rng.choice(around, m, replace=False)
-    else:  # stratified over the window, with jitter
-        edges = np.linspace(0, n, m + 1)
+    else:  # stratified over the window, with jitter; whole edges, so that no frame is drawn twice
+        edges = np.floor(np.linspace(0, n, m + 1))
         contexts = start + np.floor(rng.uniform(edges[:-1], edges[1:])).astype(int)
         rng.shuffle(contexts)
     return contexts, window if rng.random() < 0.5 else window[::-1]
