@@ -343,7 +343,7 @@ def held_out_change(log: Path) -> str:
     if len(found) < 2:
         return ""
     (first, before), (last, after) = found[0], found[-1]
-    return f"; held-out loss {before:.4g} at step {first}, {after:.4g} at step {last}"
+    return f"; held-out loss {before:.5g} at step {first}, {after:.5g} at step {last}"
 
 
 def _check_fits(folder: Path, step: int, state: Tree) -> None:

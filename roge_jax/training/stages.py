@@ -207,7 +207,7 @@ def for_one_scene(stage: Stage) -> Stage:
     Drawn once per step at the rate of large batches, the gradients of a small model are mostly noise: its held-out
     loss rises from the first step on.
     """
-    optim = dataclasses.replace(stage.optim, learning_rate=2e-5, decay=0.5, ema=0.98)
+    optim = dataclasses.replace(stage.optim, learning_rate=4e-6, decay=0.5, ema=0.98)
     return dataclasses.replace(stage, draws=8, optim=optim)
 
 
