@@ -186,7 +186,8 @@ def test_held_out_scenes_are_scored_undisturbed(monkeypatch):
     """However a stage draws and alters its samples: the same views, pictures and cameras are scored."""
     from roge_jax.data import procedural
 
-    def sequence(seed, frames, height, width):
+    def sequence(seed, *, frames, height, width, depth, varied):
+        assert seed >= procedural.HELDOUT_SEED and varied  # of the kind that training draws
         rng = np.random.default_rng(seed)
         c2w = np.tile(np.eye(4), (frames, 1, 1))
         c2w[:, :3, 3] = rng.standard_normal((frames, 3))

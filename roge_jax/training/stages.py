@@ -207,7 +207,7 @@ def for_one_scene(stage: Stage) -> Stage:
     Drawn once per step at the rate of large batches, the gradients of a small model are mostly noise: its held-out
     loss rises from the first step on.
     """
-    optim = dataclasses.replace(stage.optim, learning_rate=4e-6, decay=0.5, ema=0.98)
+    optim = dataclasses.replace(stage.optim, learning_rate=5e-6, decay=0.5, ema=0.98)
     return dataclasses.replace(stage, draws=8, optim=optim)
 
 
@@ -405,17 +405,16 @@ def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, cli
 def held_out(
     objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16, encode=None
 ):
-    """evaluate(trainable) -> the stage's own terms on held-out procedural scenes, prefixed `held_`.
+    """evaluate(trainable) -> the stage's own terms on held-out scenes of the kind that is rendered for training, prefixed `held_`.
 
     `encode`: from the arrays of one sample to those that the objective takes; None: as they are.
     """
-    from ..data.procedural import HELDOUT_SEED, sample_sequence
+    from ..data.procedural import HELDOUT_SEED
+    from ..data.source import ProceduralSource
 
     frames = max(24, config.frames + 3)
-    pool = [
-        sample_sequence(HELDOUT_SEED + i, frames=frames, height=config.height, width=config.width)
-        for i in range(scenes)
-    ]
+    source = ProceduralSource(config.height, config.width, frames)
+    pool = [source[HELDOUT_SEED + i] for i in range(scenes)]
     views = stage.views.undisturbed()
     views = dataclasses.replace(views, contexts=(3,), context_weights=(1.0,), size=None)
     fixed = dataclasses.replace(stage, views=views, batch=4)
