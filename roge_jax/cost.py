@@ -314,8 +314,8 @@ def estimate(
     """A window with m photos. `fused_attention`: scores are never stored (GPU, bfloat16).
 
     Working memory counts the tensors that live at the same time: attention scores, a block's queries,
-    keys, values and hidden layer, the full-size maps of the VAE. XLA allocates within a factor of two of it on CPU, less where heads come by
-    themselves there (`core.attention`).
+    keys, values and hidden layer, the full-size maps of the VAE. XLA allocates within a factor of two of it on CPU,
+    less where heads come by themselves there (`core.attention`).
     """
     n, slots = config.frames, config.slots(m)
     size = (config.recon_height, config.recon_width)
