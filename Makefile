@@ -27,8 +27,8 @@ help:  ## this list
 sample: $(BASE)  ## two real photos in, the video along a path out (outputs/sample)
 	$(RUN) -m roge_jax.sample --out outputs/sample $(ARGS)
 
-train: $(BASE)  ## train the shipped model further, end to end, into a new folder under runs/
-	$(RUN) -m roge_jax.train mini --evaluate-every 50 --diagnose-every 100 --out runs/$(shell date +%Y%m%d-%H%M%S) $(ARGS)
+train: $(BASE)  ## train the shipped model further, end to end and to larger pictures, into a new folder under runs/
+	$(RUN) -m roge_jax.train mini --stage joint --size 96x160 --evaluate-every 20 --out runs/$(shell date +%Y%m%d-%H%M%S) $(ARGS)
 
 evaluate: $(BASE)  ## the shipped model beside its baselines on held-out scenes
 	$(RUN) -m roge_jax.evaluate --scenes procedural:1000000000..1000000009 --out outputs/results.json $(ARGS)

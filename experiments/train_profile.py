@@ -1,9 +1,9 @@
-"""Where the time of a training step goes: `make train`'s step (stage `lora` of the shipped model), taken apart.
+"""Where the time of a training step goes: `make train`'s step (stage `joint` of the shipped model), taken apart.
 
     python experiments/train_profile.py                    # writes experiments/results/train_profile.json
-    taskset -c 0-3 python experiments/train_profile.py --photos 3 --repeats 9
+    taskset -c 0-3 python experiments/train_profile.py --photos 3 --repeats 9 --size 64x112
 
-About 8 minutes on 4 cores, most of it compiling. One scene of `--photos` photos and 17 frames, drawn as the program draws it.
+About 15 minutes on 4 cores, most of it compiling. One scene of `--photos` photos and 17 frames, drawn as the program draws it.
 Compiled on their own and timed in turn: the step; loss and gradient; the loss alone; and the loss's parts, each on the
 arrays that it gets there. Backward is gradient minus loss, optimiser is step minus gradient. Times are CPU seconds of the process
 (medians with lowest and highest), which other programs disturb least; wall seconds stand beside them, and
@@ -36,20 +36,21 @@ def timed(function) -> tuple[float, float]:
     return time.process_time() - cpu, time.perf_counter() - wall
 
 
-def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
+def profile(checkpoint: str, size: str, photos: int, repeats: int, seed: int) -> dict:
     import jax
 
     from roge_jax import model
     from roge_jax.checkpoint import load_model
     from roge_jax.core.lora import attach
-    from roge_jax.core.params import count, init
+    from roge_jax.core.params import count
     from roge_jax.data.source import ProceduralSource
     from roge_jax.entry import environment
-    from roge_jax.training import loop, stages
+    from roge_jax.training import loop, stages, start
     from roge_jax.training.optim import make_optimiser
 
     params, config = load_model(checkpoint)
-    stage = stages.for_one_scene(stages.lora_stage(200, frames=config.frames))
+    config = start.resize(config, size, hires=False)
+    stage = stages.find_stage(stages.mini_stages(frames=config.frames), "joint")
     working = stages.stage_config(config, stage)
     source = ProceduralSource(working.height, working.width, frames=max(24, working.frames + 3))
     draw = functools.partial(stages.stage_batch, source, stage, working, seed)
@@ -58,7 +59,6 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
 
     specs, _ = stages.stage_specs(config, stage)
     trainable, frozen = model.split(params, stage.trains)
-    trainable = attach(trainable, init(jax.random.key(seed + 1), stages.new_leaves(config, stage)))
     optimiser = make_optimiser(stage.optim, specs, stage.steps)
     objective = functools.partial(stages.joint_objective, config=working, stage=stage)
     key = jax.random.key(seed)
@@ -117,8 +117,8 @@ def profile(checkpoint: str, photos: int, repeats: int, seed: int) -> dict:
     shares["backward"] = middle["gradient"] - middle["loss"]
     shares["optimiser"] = middle["step"] - middle["gradient"]
     return {
-        "command": f"python experiments/train_profile.py --checkpoint {checkpoint} --photos {photos} "
-        f"--repeats {repeats} --seed {seed}",
+        "command": f"python experiments/train_profile.py --checkpoint {checkpoint} --size {size} "
+        f"--photos {photos} --repeats {repeats} --seed {seed}",
         "environment": environment(),
         "cores": len(os.sched_getaffinity(0)),
         "load_average": os.getloadavg(),
@@ -140,6 +140,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     p.add_argument("--checkpoint", default="mini", help="model folder or name")
+    p.add_argument("--size", default="96x160", help="HEIGHTxWIDTH (default: 96x160)")
     p.add_argument("--photos", type=int, default=3)
     p.add_argument("--repeats", type=int, default=9)
     p.add_argument("--seed", type=int, default=0)
@@ -147,7 +148,7 @@ def main() -> None:
     args = p.parse_args()
     from roge_jax.folders import write_json
 
-    found = profile(args.checkpoint, args.photos, args.repeats, args.seed)
+    found = profile(args.checkpoint, args.size, args.photos, args.repeats, args.seed)
     write_json(args.out, found)
     print(f"{'part':16s} {'share':>6s}")
     for name, share in found["share_of_step"].items():

@@ -11,6 +11,7 @@ itself). A scene's `views` are a dict of arrays, contexts first:
     context_recon, target_recon             optional: the same views at reconstruction size
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -337,11 +338,8 @@ def loss(
     """
     params = attach(frozen, trainable)
     scenes = batch["K"].shape[0]
-    terms = over_scenes(
-        lambda views, key: scene_loss(params, views, key, config=config, draws=draws, remat=remat),
-        batch,
-        jax.random.split(key, scenes),
-    )
+    term = functools.partial(scene_loss, config=config, draws=draws, remat=remat)
+    terms = over_scenes(term, params, batch, jax.random.split(key, scenes))
     terms = {name: value.mean() for name, value in terms.items()}
     return terms["flow"] + config.flow.photometric * terms["photometric"], terms
 

@@ -506,10 +506,11 @@ def test_the_published_sizes_trace_from_photos_to_velocity(name):
 
 
 def test_scenes_one_by_one_equal_all_at_once():
-    def scene(views, key):
-        return {"sum": (views["a"] @ views["a"].T).sum() + jax.random.normal(key)}
+    def scene(factor, views, key):
+        return {"sum": factor * (views["a"] @ views["a"].T).sum() + jax.random.normal(key)}
 
     batch = {"a": jax.random.normal(jax.random.key(0), (3, 4, 5))}
     keys = jax.random.split(jax.random.key(1), 3)
-    together = jax.vmap(scene)(batch, keys)["sum"]
-    np.testing.assert_allclose(model.over_scenes(scene, batch, keys)["sum"], together, rtol=1e-6)
+    together = jax.vmap(scene, (None, 0, 0))(2.0, batch, keys)["sum"]
+    found = model.over_scenes(scene, 2.0, batch, keys)["sum"]
+    np.testing.assert_allclose(found, together, rtol=1e-6)

@@ -363,3 +363,49 @@ class TestBatches:
         for name, x in whole.items():
             np.testing.assert_array_equal(part[name], x[[1, 4]])
         assert not np.array_equal(whole["target_rgb"][0], whole["target_rgb"][1])
+
+
+class TestOverScenes:
+    """`over_scenes` on CPU devices: each goes through its own scenes, as a lone one goes through all."""
+
+    @staticmethod
+    def run(mesh, scenes: int):
+        """(mean, gradient, the meshes that a scene saw, the compiled program) of a small product of every scene."""
+        rng, seen = np.random.default_rng(0), []
+        params = {"w": rng.normal(size=(6, 5)).astype(np.float32)}
+        batch = {"x": rng.normal(size=(scenes, 7, 6)).astype(np.float32)}
+        keys = jax.random.split(jax.random.key(1), scenes)
+
+        def scene(params, views, key):
+            seen.append(sharding.current())
+            noise = jax.random.normal(key, (7, 5))
+            return {"y": jnp.square(jnp.tanh(views["x"] @ params["w"]) - noise).mean()}
+
+        def loss(params, batch, keys):
+            return sharding.over_scenes(scene, params, batch, keys)["y"].mean()
+
+        with sharding.use(mesh):
+            if mesh is not None and scenes % mesh.shape["data"] == 0:
+                batch = global_batch(batch, mesh, scenes)
+            program = jax.jit(jax.value_and_grad(loss)).lower(params, batch, keys).compile()
+        value, grads = program(params, batch, keys)
+        return float(value), np.asarray(grads["w"]), seen, program.as_text()
+
+    @pytest.mark.parametrize("scenes", [8, 24])
+    def test_equal_to_one_by_one(self, scenes):
+        value, grads, seen, _ = self.run(None, scenes)
+        found, split, inside, text = self.run(sharding.make_mesh(data=8), scenes)
+        assert abs(found - value) < 1e-6 * value
+        np.testing.assert_allclose(split, grads, rtol=1e-5, atol=1e-6 * np.abs(grads).max())
+        assert set(seen) == set(inside) == {None}, "a scene on its device is a scene of a lone CPU"
+        assert "all-reduce" in text, "the devices' gradients are added"
+        assert "all-gather" not in text
+
+    @pytest.mark.parametrize(("sizes", "scenes"), [((4, 2, 1), 8), ((1, 1, 8), 8), ((8, 1, 1), 12)])
+    def test_all_at_once_where_more_is_split_or_scenes_are_left_over(self, sizes, scenes):
+        mesh = sharding.make_mesh(*sizes)
+        value, grads, _, _ = self.run(None, scenes)
+        found, split, inside, _ = self.run(mesh, scenes)
+        assert abs(found - value) < 1e-6 * value
+        np.testing.assert_allclose(split, grads, rtol=1e-5, atol=1e-6 * np.abs(grads).max())
+        assert set(inside) == {mesh}

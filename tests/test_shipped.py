@@ -1,12 +1,15 @@
 """The shipped weights: their reconstruction is ahead of what needs no learning, on photos far apart and close together."""
 
 import functools
+import json
+import re
+from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-from roge_jax import checkpoint, evaluate, model
+from roge_jax import checkpoint, evaluate, model, train
 from roge_jax.data.views import make_sample
 from roge_jax.metrics.baselines import baselines
 from roge_jax.metrics.image import image_metrics
@@ -74,3 +77,32 @@ def test_the_shipped_files_are_small():
     files = list(checkpoint.find_model("mini").glob("*.safetensors"))
     sizes = [file.stat().st_size for file in files]
     assert files and sum(sizes) <= 64e6 and max(sizes) <= 16e6
+
+
+def make_train(*more) -> list[str]:
+    """The words of `make train` behind the program, but for its folder."""
+    makefile = (Path(__file__).parents[1] / "Makefile").read_text()
+    words = re.search(r"-m roge_jax\.train (mini .*) --out", makefile).group(1)
+    return [*words.split(), *map(str, more)]
+
+
+def test_make_train_goes_on_end_to_end_at_a_larger_size():
+    args = train.parser().parse_args(make_train())
+    config, [stage] = train.choose(args, checkpoint.load_config(checkpoint.find_model("mini")))
+    assert (config.height, config.width) == (config.recon_height, config.recon_width) == (96, 160)
+    trained = {part for part, _ in model.split(model.specs(config), stage.trains)[0].items()}
+    assert stage.objective == "joint" and trained == {"dit", "fusion", "encoder", "renderer"}
+    assert train.starting_point(args) == "mini" and 0 < args.evaluate_every < stage.steps
+
+
+@pytest.mark.slow  # some minutes, most of them compiling
+def test_make_train_lowers_the_held_out_loss(tmp_path):
+    train.main(
+        train.parser().parse_args(
+            make_train("--steps", 12, "--evaluate-every", 12, "--out", tmp_path)
+        )
+    )
+    rows = [json.loads(line) for line in (tmp_path / "joint/log.jsonl").read_text().splitlines()]
+    held = [row["held_loss"] for row in rows if "held_loss" in row]
+    assert len(held) == 2 and held[1] < held[0] - 0.001
+    assert checkpoint.load_config(tmp_path / "joint/model").width == 160

@@ -12,6 +12,7 @@ XLA inserts the communication. Model code names logical axes only; without a mes
 
 import contextlib
 import contextvars
+import functools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -365,12 +366,29 @@ def check_heads(heads: int, mesh: AnyMesh | None) -> None:
         )
 
 
-def over_scenes(f: Callable, *batch):
-    """f(*scene) of every scene of a batch (leading axis of every array): all at once, or one by one on a lone CPU.
+def over_scenes(f: Callable, params: Tree, *batch):
+    """f(params, *scene) of every scene of a batch (leading axis of every array).
 
-    One scene's matrix products fill a CPU, and the gradients of batched products are slow there (see `matmul`).
+    All at once, but one by one on a CPU: one scene's matrix products fill it, and the gradients of batched products
+    are slow there (see `matmul`). Where CPU devices split nothing but the batch, each goes through its own scenes.
     """
-    if jax.default_backend() == "cpu" and current() is None:
-        return jax.lax.map(lambda scene: f(*scene), batch)
-    scenes = jax.tree.leaves(batch)[0].shape[0]
-    return jax.vmap(f, spmd_axis_name=batch_axes(scenes))(*batch)
+
+    def one_by_one(params, batch):
+        with use(None):
+            return jax.lax.map(lambda scene: f(params, *scene), batch)
+
+    mesh, scenes = current(), jax.tree.leaves(batch)[0].shape[0]
+    if jax.default_backend() == "cpu":
+        if mesh is None:
+            return one_by_one(params, batch)
+        if isinstance(mesh, Mesh) and mesh.size == mesh.shape["data"] and scenes % mesh.size == 0:
+            split, whole = PartitionSpec("data"), PartitionSpec()
+            run = jax.shard_map(
+                one_by_one,
+                mesh=mesh,
+                in_specs=(whole, split),
+                out_specs=split,
+                check_vma=False,  # loops over scenes start from constants, which lie everywhere
+            )
+            return run(params, batch)
+    return jax.vmap(functools.partial(f, params), spmd_axis_name=batch_axes(scenes))(*batch)

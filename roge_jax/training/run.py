@@ -148,7 +148,7 @@ def _tell(parts: Parts, params: Tree, stage: Stage, config, mesh, dtype: str, *,
     working = stages.stage_config(config, stage)
     print(
         f"{stage.name}: {count(parts.trainable):,} of {count(params):,} parameters train, {stage.steps} steps of "
-        f"{stage.batch} scenes at {working.height}x{working.width}, {layout} ({jax.devices()[0].device_kind})"
+        f"{stage.batch} scene{'s' * (stage.batch > 1)} at {working.height}x{working.width}, {layout} ({jax.devices()[0].device_kind})"
     )
 
 

@@ -62,7 +62,7 @@ def recon_objective(trainable, frozen, batch, key, *, config, stage):
             config, renderer=dataclasses.replace(config.renderer, lookup=0)
         )
 
-    def scene(views):
+    def scene(params, views):
         tokens = model.reconstruct(params, views, config=config)
         targets = model.only_targets(views)
         features = model.query_rays(params, tokens, targets, config=config, context=views)
@@ -73,7 +73,7 @@ def recon_objective(trainable, frozen, batch, key, *, config, stage):
 
         return {part: error(getattr(shown, part)) for part in ("rgb", "photos", "coarse")}
 
-    terms = {name: value.mean() for name, value in model.over_scenes(scene, batch).items()}
+    terms = {name: value.mean() for name, value in model.over_scenes(scene, params, batch).items()}
     told = {"psnr": -10 * jnp.log10(terms["rgb"])}
     if not stage.lookup:
         return terms["rgb"], told
@@ -85,7 +85,7 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
     """Flow matching without rays or geometry: photos to video, the generator that RoGe starts from."""
     params = attach(frozen, trainable)
 
-    def scene(views, key):
+    def scene(params, views, key):
         m = views["context_rgb"].shape[0]
         latents = [
             model.encode_contexts(params, views["context_rgb"], config=config),
@@ -96,7 +96,8 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
         options = {"config": config, "contexts": m, "remat": stage.remat}
         return model.mean_flow_matching(params, x0, cond, key, draws=stage.draws, **options)
 
-    loss = model.over_scenes(scene, batch, jax.random.split(key, batch["K"].shape[0])).mean()
+    keys = jax.random.split(key, batch["K"].shape[0])
+    loss = model.over_scenes(scene, params, batch, keys).mean()
     return loss, {"flow": loss}
 
 
@@ -110,11 +111,9 @@ def encoded_objective(trainable, frozen, batch, key, *, config, stage):
     """The flow term of `joint_objective` on samples that were encoded before (`training.encoded`)."""
     params = attach(frozen, trainable)
     options = {"config": config, "draws": stage.draws, "remat": stage.remat}
-    loss = model.over_scenes(
-        lambda clip, key: encoded.flow_term(params, clip, key, **options),
-        batch,
-        jax.random.split(key, batch["K"].shape[0]),
-    ).mean()
+    keys = jax.random.split(key, batch["K"].shape[0])
+    term = functools.partial(encoded.flow_term, **options)
+    loss = model.over_scenes(term, params, batch, keys).mean()
     return loss, {"flow": loss}
 
 
@@ -140,6 +139,9 @@ _SCRATCH = OptimConfig(
 )
 
 _GENTLE = dataclasses.replace(_SCRATCH, learning_rate=1e-3)
+
+# One scene a step on a trained model: steps of twice the rate undo more than they learn (docs/training.md).
+_FINE = dataclasses.replace(_SCRATCH, learning_rate=2e-4, warmup=10, betas=(0.9, 0.98), ema=0.99)
 
 
 # Small convolutions, many with one output: Muon was not tried.
@@ -183,9 +185,7 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list
         Stage(
             "vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=crop
         ),
-        Stage(
-            "joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 3, _SCRATCH, video, draws=4
-        ),
+        Stage("joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 1, _FINE, video, draws=6),
     ]
     return [dataclasses.replace(s, steps=max(1, round(s.steps * scale))) for s in stages]
 
@@ -205,9 +205,12 @@ def for_one_scene(stage: Stage) -> Stage:
     """A LoRA stage whose steps see one scene instead of the paper's 192: less noise per step, and smaller steps.
 
     Drawn once per step at the rate of large batches, the gradients of a small model are mostly noise: its held-out
-    loss rises from the first step on.
+    loss rises from the first step on. Muon brings the shares of the wide embeddings (`optim.adam_shares`), without
+    which their steps of one size per weight undo what the rest learns.
     """
-    optim = dataclasses.replace(stage.optim, learning_rate=5e-6, decay=0.5, ema=0.98)
+    optim = dataclasses.replace(
+        stage.optim, name="muon", learning_rate=1e-4, weight_decay=0.0, decay=0.5, ema=0.98
+    )
     return dataclasses.replace(stage, draws=8, optim=optim)
 
 
