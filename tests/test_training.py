@@ -25,6 +25,7 @@ from roge_jax.core.layers import linear, linear_specs
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
 from roge_jax.training import loop as training
+from roge_jax.training import stages
 from roge_jax.training.loop import DivergenceDetector, LoopConfig, TrainingStopped
 from roge_jax.training.optim import (
     OptimConfig,
@@ -665,17 +666,33 @@ def test_wide_embeddings_take_smaller_steps_of_adam():
         "fusion/rays_embed/kernel": 256 / (2 * 2 * 1536),
         "fusion/geometry_embed/kernel": 256 / (2 * 2 * 512),
     }
-    some = {name: specs[name] for name in ("fusion",)}
+    some = {"fusion": {name: spec for name, spec in specs["fusion"].items() if "embed" in name}}
     optimiser = make_optimiser(
         OptimConfig(name="muon", learning_rate=1.0, warmup=1, clip=0.0, weight_decay=0.0), some, 10
     )
-    p = params.init(jax.random.key(0), some)
+    p = jax.tree.map(lambda spec: jnp.zeros(spec.shape), some, is_leaf=lambda x: hasattr(x, "axes"))
     updates, _ = optimiser.update(jax.tree.map(jnp.ones_like, p), optimiser.init(p), p)
     flat = flatten(updates)
     step = flat["fusion/rays_embed/bias"][0]  # Adam's first step is the same for every weight
+    assert len(flat) > len(small)
     for path, moved in flat.items():
-        if "embed" in path:
-            np.testing.assert_allclose(moved, shares[path] * step, rtol=1e-5)
+        np.testing.assert_allclose(moved, shares[path] * step, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("small", "share"), [(True, 256 / (2 * 2 * 1536)), (False, 1.0)])
+def test_lora_of_a_small_model_steps_wide_embeddings_by_their_share(small, share):
+    stage = stages.lora_stage(10)
+    stage = stages.for_one_scene(stage) if small else stage
+    found = flatten(stages.stage_specs(preset("mini"), stage)[0])
+    wide, factor = "fusion/rays_embed/kernel", "dit/blocks/self_attn/q/lora_b"
+    specs = params.unflatten({path: found[path] for path in (wide, factor)})
+    optim = dataclasses.replace(stage.optim, warmup=1, clip=0.0, weight_decay=0.0)
+    zeros = jax.tree.map(lambda s: jnp.zeros(s.shape), specs, is_leaf=lambda x: hasattr(x, "axes"))
+    optimiser = make_optimiser(optim, specs, 10)
+    updates, _ = optimiser.update(jax.tree.map(jnp.ones_like, zeros), optimiser.init(zeros), zeros)
+    moved = {path: np.abs(x).mean() for path, x in flatten(updates).items()}
+    assert moved[factor] > 0
+    np.testing.assert_allclose(moved[wide], share * moved[factor], rtol=1e-5)
 
 
 def test_a_muon_update_moves_every_direction_of_every_layer_alike():
