@@ -70,7 +70,7 @@ def test_options_exist(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_files_named_in_the_text_exist(page):
-    pattern = r"(?:experiments|tests|notebooks|roge_jax)/[\w/]+\.(?:py|json|ipynb|md|png)"
+    pattern = r"(?:experiments|tests|notebooks|roge_jax)/[\w/]+\.(?:py|jsonl?|ipynb|md|png)"
     faults = [name for name in re.findall(pattern, page.read_text()) if not (ROOT / name).exists()]
     expected = {"experiments/results/train_profile.json"}  # written by a command
     assert not set(faults) - expected, faults
