@@ -5,7 +5,7 @@
 
 The end-to-end step (stage `joint` of the shipped model, 3 photos, 17 frames, 6 noise levels) on N scenes: one device that
 goes through them one after the other with all cores, and N devices with one scene each. Both in one process, in turn; wall and
-processor seconds, medians with lowest and highest. About 10 minutes on 4 cores, most of it compiling.
+processor seconds, medians with lowest and highest. About 5 minutes on 4 cores, most of it compiling.
 """
 
 import argparse

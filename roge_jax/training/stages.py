@@ -205,8 +205,8 @@ def for_one_scene(stage: Stage) -> Stage:
     """A LoRA stage whose steps see one scene instead of the paper's 192: less noise per step, and smaller steps.
 
     Drawn once per step at the rate of large batches, the gradients of a small model are mostly noise: its held-out
-    loss rises from the first step on. Muon brings the shares of the wide embeddings (`optim.adam_shares`), without
-    which their steps of one size per weight undo what the rest learns.
+    loss rises from the first step on. Muon brings the shares of the wide embeddings (`optim.adam_shares`),
+    whose steps of one size per weight are too large under AdamW.
     """
     optim = dataclasses.replace(
         stage.optim, name="muon", learning_rate=1e-4, weight_decay=0.0, decay=0.5, ema=0.98
