@@ -60,7 +60,7 @@ format: $(DEV)  ## let ruff order imports and lay out the code
 figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/figures.md has single ones)
 	$(RUN) -m roge_jax.evaluate --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
 	$(RUN) -m roge_jax.evaluate --sweep 100 130 --out experiments/results/mini_wide.json
-	$(RUN) -m roge_jax.data.procedural sheet --out docs/procedural.png
+	$(RUN) -m roge_jax.procedural sheet --out docs/procedural.png
 	$(RUN) experiments/training_curves.py --draw
 	@for f in $(FIGURES); do echo "== $$f"; $(RUN) $$f || exit 1; done
 

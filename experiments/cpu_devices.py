@@ -28,7 +28,7 @@ def measure(devices: int, size: str | None, repeats: int, seed: int) -> dict:
     from roge_jax.core import sharding
     from roge_jax.core.distributed import global_batch
     from roge_jax.data.source import ProceduralSource
-    from roge_jax.entry import environment
+    from roge_jax.files.entry import environment
     from roge_jax.training import loop, stages, start
     from roge_jax.training.optim import make_optimiser
 
@@ -98,7 +98,7 @@ def main() -> None:
     args = p.parse_args()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from roge_jax.core.distributed import request_devices
-    from roge_jax.folders import write_json
+    from roge_jax.files.folders import write_json
 
     request_devices(args.devices)
     found = measure(args.devices, args.size, args.repeats, args.seed)

@@ -24,7 +24,7 @@ def measure(photos: int, repeats: int) -> dict:
     from roge_jax import model
     from roge_jax.checkpoint import load_model
     from roge_jax.data.source import ProceduralSource
-    from roge_jax.entry import environment
+    from roge_jax.files.entry import environment
     from roge_jax.training import encoded, loop, stages
     from roge_jax.training.optim import make_optimiser
 
@@ -79,7 +79,7 @@ def main() -> None:
     p.add_argument("--photos", type=int, default=3)
     p.add_argument("--repeats", type=int, default=3)
     args = p.parse_args()
-    from roge_jax.folders import write_json
+    from roge_jax.files.folders import write_json
 
     found = measure(args.photos, args.repeats)
     write_json(RESULTS, found)

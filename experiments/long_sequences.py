@@ -240,7 +240,7 @@ def main() -> None:
         record = json.loads(RESULT.read_text()) if RESULT.exists() else {}
         import jax  # noqa: F401  the record names its version
 
-        from roge_jax.entry import environment
+        from roge_jax.files.entry import environment
 
         record[part] = found | {"environment": environment()}
         RESULT.write_text(json.dumps(record, indent=1) + "\n")

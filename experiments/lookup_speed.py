@@ -23,7 +23,7 @@ sys.path.insert(0, str(HERE.parent))
 import roge_jax as rj  # noqa: E402
 from experiments.dit_speed import measure  # noqa: E402
 from roge_jax.core.layers import conv2d, convolve  # noqa: E402
-from roge_jax.entry import environment  # noqa: E402
+from roge_jax.files.entry import environment  # noqa: E402
 from roge_jax.recon import lookup  # noqa: E402
 
 RESULT = HERE / "results" / "lookup_speed.json"

@@ -80,7 +80,7 @@ def main() -> None:
     args = p.parse_args()
     if args.case:
         return print(json.dumps(check(*args.case.split(",")[:2])))
-    from roge_jax.entry import environment
+    from roge_jax.files.entry import environment
 
     rows: dict[str, dict] = {}
     print("| case | planned, MB | XLA, MB | all | temporary alone |\n|---|---|---|---|---|")

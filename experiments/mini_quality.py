@@ -41,9 +41,9 @@ from quality.scenes import (
 
 from roge_jax.checkpoint import load_model, weights_fingerprint
 from roge_jax.config import FlowConfig, RoGeConfig
-from roge_jax.data.procedural import HELDOUT_SEED
-from roge_jax.entry import enable_cache
 from roge_jax.errors import UserError
+from roge_jax.files.entry import enable_cache
+from roge_jax.procedural.scenes import HELDOUT_SEED
 from roge_jax.video import flow
 
 OUT = Path(__file__).parent / "results"

@@ -25,7 +25,7 @@ import numpy as np
 from quality.scenes import DEFAULT_M, Sampler, assemble, most_steps, render
 
 from roge_jax.checkpoint import load_model, weights_fingerprint
-from roge_jax.entry import enable_cache
+from roge_jax.files.entry import enable_cache
 from roge_jax.video import flow, solvers
 
 OUT = Path(__file__).parent / "results"

@@ -39,11 +39,11 @@ import plan_report
 from plan_runs import RUNGS, Engine, LadderScene, fit, make, rms, turn_knobs
 
 from roge_jax import checkpoint
-from roge_jax.data import coverage
-from roge_jax.data.procedural import HELDOUT_SEED
-from roge_jax.data.scene import select_context
 from roge_jax.planning import options, proxies, stretches, table
 from roge_jax.planning.plan import plan
+from roge_jax.procedural.scenes import HELDOUT_SEED
+from roge_jax.scenes import coverage
+from roge_jax.scenes.scene import select_context
 from roge_jax.video import solvers
 
 OUT = Path(__file__).parent / "results" / "plan_ladder.json"

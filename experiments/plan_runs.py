@@ -9,14 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from roge_jax import evaluate, model, preview, programs, sampling
-from roge_jax.data import coverage, procedural
-from roge_jax.data.raycast import OBJECTS, ROOM, render_views
+from roge_jax import evaluate, model, preview, sampling
 from roge_jax.geometry.cameras import Cameras, normalise
 from roge_jax.planning import proxies, stretches
 from roge_jax.planning.options import LEAST_LOSS, MERGES, full_choices
+from roge_jax.procedural import scenes as procedural
+from roge_jax.procedural.raycast import OBJECTS, ROOM, render_views
+from roge_jax.sampling import programs
+from roge_jax.sampling.windows import stretch_noise, window_noise, window_views
+from roge_jax.scenes import coverage
 from roge_jax.video import flow, solvers
-from roge_jax.windows import stretch_noise, window_views
 
 CONTEXTS = 6
 # Of 17 frames: where the planner generates nothing alone, and why.
@@ -187,7 +189,7 @@ class Engine:
         cond = condition(self.params, known, features, views, shown=shown)
         lost = self.program(preview.lost_detail, config)(self.params, shown, cond)
         prepared = model.Prepared(known, features, shown, cond, None, lost)
-        noise = sampling.window_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
+        noise = window_noise(0, 0, CONTEXTS, self.config)[-self.config.slots(m) :]
         noise = stretch_noise(noise, m, first, config)
         settings = dataclasses.replace(
             self.settings, steps=choices.steps, solver=choices.solver, schedule=choices.schedule

@@ -43,7 +43,7 @@ def on_gpu() -> bool:
 
 def device() -> dict:
     """Environment of the run, the GPU's name, driver and limits included."""
-    code = "import json, jax; jax.devices(); from roge_jax.entry import environment; print(json.dumps(environment()))"
+    code = "import json, jax; jax.devices(); from roge_jax.files.entry import environment; print(json.dumps(environment()))"
     found = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, cwd=HERE.parent
     )

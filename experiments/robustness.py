@@ -13,7 +13,7 @@ true median depth: it knows more than the model).
 Curves: mean over scenes; bands: 95 % bootstrap of the *change* from the undisturbed value over scenes, so that the
 scenes' own difficulty cancels. A method *breaks* where its mean PSNR has lost 1 dB, by linear interpolation between
 levels, with a bootstrap interval; a second break is where it falls below `nearest` under the same disturbance.
-With --limits the earlier 1 dB break of the two outputs, in units of what can be seen at run time (`roge_jax.limits`),
+With --limits the earlier 1 dB break of the two outputs, in units of what can be seen at run time (`roge_jax.sampling.limits`),
 becomes the limit of the warning; where a limit is an estimate from the photos and more than 5 % of 200 undisturbed
 scenes lie beyond it, it moves outwards to their 95 % quantile. What wrong poses and focal lengths show in matched photos
 is measured without the network (`robustness_matching`). `--only` measures some of it again and keeps the rest. The published system reports no such curves. Our numbers: docs/robustness.md.
@@ -49,20 +49,22 @@ from robustness_report import (
     write_limits,
 )
 
-from roge_jax import checkpoint, entry, limits, programs, sampling
-from roge_jax.data import perturb
-from roge_jax.data.procedural import (
+from roge_jax import checkpoint, sampling
+from roge_jax.data import faults
+from roge_jax.errors import LimitWarning
+from roge_jax.files import entry
+from roge_jax.geometry.cameras import Cameras, scale_focal
+from roge_jax.geometry.crops import resize, scale_K
+from roge_jax.metrics import baselines, image, report
+from roge_jax.procedural.raycast import render_views
+from roge_jax.procedural.scenes import (
     HELDOUT_SEED,
     camera_path,
     intrinsics,
     load_textures,
     make_scene,
 )
-from roge_jax.data.raycast import render_views
-from roge_jax.errors import LimitWarning
-from roge_jax.geometry.cameras import Cameras
-from roge_jax.geometry.crops import resize, scale_K
-from roge_jax.metrics import baselines, image, report
+from roge_jax.sampling import limits, programs
 
 OUT = Path(__file__).parent / "results"
 STILL = 200  # scenes that say how the estimates from photos vary by themselves
@@ -121,7 +123,7 @@ class Place:
 
     def zoomed(self, ratio: float) -> Case:
         case = self.case(spread(3))
-        target = perturb.scale_focal(case.target, 1.0 / ratio)
+        target = scale_focal(case.target, 1.0 / ratio)
         truth, depth = self.render(target.K, target.c2w)
         return case._replace(target=target, truth=truth, depth=depth)
 
@@ -158,24 +160,24 @@ def disturbed(place: Place, knob: str, level: float) -> Case:
     centres = base.context.centres
     baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
     if knob == "rotation":
-        return base._replace(context=perturb.turn_cameras(base.context, level, rng))
+        return base._replace(context=faults.turn_cameras(base.context, level, rng))
     if knob == "position":
-        return base._replace(context=perturb.move_cameras(base.context, level * baseline, rng))
+        return base._replace(context=faults.move_cameras(base.context, level * baseline, rng))
     if knob == "focal":
         sign = 1.0 if place.seed % 2 else -1.0
         factor = (1 + level / 100) ** sign
-        return base._replace(context=perturb.scale_focal(base.context, factor))
+        return base._replace(context=scale_focal(base.context, factor))
     if knob == "noise":
-        return base._replace(images=perturb.add_noise(base.images, level, rng))
+        return base._replace(images=faults.add_noise(base.images, level, rng))
     if knob == "blur":
-        return base._replace(images=perturb.blur(base.images, level))
+        return base._replace(images=faults.blur(base.images, level))
     if knob in SHRUNK:
         large = place.large(SHRUNK[knob]) if SHRUNK[knob] > 1 else base.images
-        coded = large if level == KNOBS[knob].still else perturb.jpeg(large, int(level))
+        coded = large if level == KNOBS[knob].still else faults.jpeg(large, int(level))
         return base._replace(images=np.stack([resize(x, *place.size) for x in coded]))
     if knob == "exposure":
         stops = level * rng.permutation([-0.5, 0.0, 0.5])
-        return base._replace(images=perturb.expose(base.images, stops))
+        return base._replace(images=faults.expose(base.images, stops))
     if knob in ("photos", "more"):
         return place.case(spread(int(level)))
     if knob == "copies":

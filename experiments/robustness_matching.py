@@ -2,7 +2,7 @@
 
 No program of its own: `python experiments/robustness.py --limits` calls it, after the curves. No network. Every scene is
 what a user would have: the 49 photos of a held-out path, three of which the model is given (`robustness.spread`); each is
-matched with its partners (`data.matching.partners`), and all cameras are disturbed. Depth is known, so *exact* matches
+matched with its partners (`scenes.matching.partners`), and all cameras are disturbed. Depth is known, so *exact* matches
 give what a disturbance does by itself; photos rendered at `SCALES` times the model's size and matched by SIFT give what
 matching adds, and how often the warning comes.
 """
@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from robustness_report import KNOBS, MODELS, USUAL
 
-from roge_jax.data import matching, perturb
-from roge_jax.geometry.cameras import Cameras, invert, scale_K
+from roge_jax.data import faults
+from roge_jax.geometry.cameras import Cameras, invert, scale_focal, scale_K
+from roge_jax.scenes import matching
 
 SCENES = 40
 STEP = 4  # pixels between exact matches
@@ -53,12 +54,12 @@ def wrong(cameras: Cameras, ids: list[int], knob: str, level: float, seed: int) 
     """All cameras of a scene with the fault that `robustness.disturbed` gives the photos."""
     rng = np.random.default_rng([seed, POSES.index(knob)])
     if knob == "rotation":
-        return perturb.turn_cameras(cameras, level, rng)
+        return faults.turn_cameras(cameras, level, rng)
     if knob == "position":
         centres = cameras.centres[ids]
         baseline = np.linalg.norm(centres[:, None] - centres[None], axis=-1).max()
-        return perturb.move_cameras(cameras, level * baseline, rng)
-    return perturb.scale_focal(cameras, (1 + level / 100) ** (1.0 if seed % 2 else -1.0))
+        return faults.move_cameras(cameras, level * baseline, rng)
+    return scale_focal(cameras, (1 + level / 100) ** (1.0 if seed % 2 else -1.0))
 
 
 def seen(matches: matching.Matches, cameras: Cameras, ids: list[int]) -> list[float]:
@@ -66,7 +67,7 @@ def seen(matches: matching.Matches, cameras: Cameras, ids: list[int]) -> list[fl
     if not matches:
         return [np.nan] * 4
     error, gain = matching.focal_error(matches, cameras)
-    mended = perturb.scale_focal(cameras, 1 + error)
+    mended = scale_focal(cameras, 1 + error)
     pixels = [
         float(np.nanmax(matching.photo_misfits(matching.misfits(matches, c), ids)))
         for c in (cameras, mended)

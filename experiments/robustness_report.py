@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from roge_jax import limits
 from roge_jax.metrics import report
+from roge_jax.sampling import limits
 
 METRICS = ("psnr", "ssim", "sharpness_ratio")
 MODELS, METHODS = ("rgb_head", "generated"), ("rgb_head", "generated", "nearest", "plane")
@@ -50,7 +50,7 @@ KNOBS = {
 }  # fmt: skip
 
 SHRUNK = {"jpeg": 1, "jpeg2": 2, "jpeg4": 4, "jpeg8": 8}  # times the model's size
-# The run-time measure (of `roge_jax.limits`) that shows a knob, where one does.
+# The run-time measure (of `roge_jax.sampling.limits`) that shows a knob, where one does.
 SHOWN = {
     "extrapolation": "extrapolation", "wider": "field_ratio", "narrower": "field_ratio",
     "photos": "distinct_photos", "exposure": "exposure_stops", "blur": "sharpness", "noise": "noise",

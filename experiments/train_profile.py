@@ -44,7 +44,7 @@ def profile(checkpoint: str, size: str, photos: int, repeats: int, seed: int) ->
     from roge_jax.core.lora import attach
     from roge_jax.core.params import count
     from roge_jax.data.source import ProceduralSource
-    from roge_jax.entry import environment
+    from roge_jax.files.entry import environment
     from roge_jax.training import loop, stages, start
     from roge_jax.training.optim import make_optimiser
 
@@ -146,7 +146,7 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=0)
     p.add_argument("--out", type=Path, default=RESULTS)
     args = p.parse_args()
-    from roge_jax.folders import write_json
+    from roge_jax.files.folders import write_json
 
     found = profile(args.checkpoint, args.size, args.photos, args.repeats, args.seed)
     write_json(args.out, found)

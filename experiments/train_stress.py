@@ -29,12 +29,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from roge_jax import entry, model
+from roge_jax import model
 from roge_jax.config import preset
 from roge_jax.core.params import init as init_specs
-from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import ViewConfig
 from roge_jax.errors import UserError
+from roge_jax.files import entry
+from roge_jax.procedural.scenes import sample_sequence
 from roge_jax.training import loop as training
 from roge_jax.training import stages
 from roge_jax.training.optim import OptimConfig

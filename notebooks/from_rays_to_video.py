@@ -23,7 +23,7 @@ import numpy as np
 
 import roge_jax as rj
 from roge_jax.core.params import count, flatten
-from roge_jax.data.scene import prepare, select_context
+from roge_jax.scenes.scene import prepare, select_context
 from roge_jax.data.views import make_sample
 from roge_jax.geometry.cameras import concatenate
 from roge_jax.geometry.rays import plucker

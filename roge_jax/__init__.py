@@ -7,6 +7,9 @@ docs/library.md shows the rest. Modules are imported on first use, so that `impo
 """
 
 import importlib
+import sys
+
+from .core.lazy import Moved
 
 __version__ = "0.1.0"
 
@@ -16,11 +19,11 @@ _PUBLIC = {
     "preset": ("config", "preset"),
     "RoGeConfig": ("config", "RoGeConfig"),
     "Cameras": ("geometry.cameras", "Cameras"),
-    "Scene": ("data.scene", "Scene"),
-    "load_scene": ("data.scene", "load_scene"),
+    "Scene": ("scenes.scene", "Scene"),
+    "load_scene": ("scenes.scene", "load_scene"),
     "make_path": ("geometry.trajectories", "make_path"),
-    "load_path": ("geometry.paths", "load_path"),
-    "save_path": ("geometry.paths", "save_path"),
+    "load_path": ("scenes.paths", "load_path"),
+    "save_path": ("scenes.paths", "save_path"),
     "plan": ("planning.plan", "plan"),
     "UserError": ("errors", "UserError"),
 }
@@ -28,7 +31,6 @@ _MODULES = (
     "model",
     "config",
     "checkpoint",
-    "programs",
     "sampling",
     "fusion",
     "preview",
@@ -37,12 +39,17 @@ _MODULES = (
     "geometry",
     "recon",
     "video",
+    "scenes",
+    "procedural",
     "data",
+    "files",
     "metrics",
     "planning",
     "training",
     "weights",
 )
+
+sys.meta_path.append(Moved())
 
 __all__ = ["__version__", *_MODULES, *_PUBLIC]
 

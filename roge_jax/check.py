@@ -2,7 +2,7 @@
 
     python -m roge_jax.check SCENE [--json] [--convention opencv] [--no-matching]
 
-SCENE is a folder or file in any layout that `data.readers` knows, `motorcycle` or
+SCENE is a folder or file in any layout that `scenes.readers` knows, `motorcycle` or
 `procedural:SEED`. Exit code 0 if the scene can be used, 2 if not.
 """
 
@@ -16,11 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from roge_jax.data.matching import pose_agreement
-from roge_jax.data.scene import Scene, is_nerfstudio, open_scene
-from roge_jax.entry import execute, number, one_of
 from roge_jax.errors import UserError
-from roge_jax.folders import plain
+from roge_jax.files.entry import execute, number, one_of
+from roge_jax.files.folders import plain
 from roge_jax.geometry.cameras import (
     CONVENTIONS,
     Cameras,
@@ -33,6 +31,8 @@ from roge_jax.geometry.crops import cover_window
 from roge_jax.geometry.trajectories import focus_distance
 from roge_jax.geometry.validation import Finding, axes_votes
 from roge_jax.metrics.geometry import straightness
+from roge_jax.scenes.matching import pose_agreement
+from roge_jax.scenes.scene import Scene, is_nerfstudio, open_scene
 
 BAD_FIT = 3.0  # pixels of median epipolar distance: good poses 0.1 to 1, wrong axes 20 and more
 

@@ -23,8 +23,8 @@ from .core import memory
 from .core.lora import merged
 from .core.params import Spec, Tree, check, flatten, unflatten
 from .errors import UserError, did_you_mean
-from .fields import exists, is_file, read_json
-from .folders import fingerprint, put, share, sync
+from .files.fields import exists, is_file, read_json
+from .files.folders import fingerprint, put, share, sync
 
 SHARD_BYTES = 15_000_000
 PIECE_BYTES = 16_000_000  # of a leaf that are written at a time

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from .entry import number, one_of
+from .files.entry import number, one_of
 
 NETWORKS = ("encoder", "renderer", "vae", "dit")
 CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mask 4, condition 16
@@ -88,7 +88,7 @@ def parser() -> argparse.ArgumentParser:
 def main(args: argparse.Namespace) -> None:
     """Convert, or print what would be done. Raises: UserError with all mismatches, before anything is written."""
     from .errors import UserError
-    from .folders import check_disk
+    from .files.folders import check_disk
     from .weights import importer
 
     if args.out is None and not args.dry_run:
@@ -333,6 +333,6 @@ def summary(plan, filled, layout) -> str:
 
 
 if __name__ == "__main__":
-    from .entry import run
+    from .files.entry import run
 
     run(main, parser())

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from .entry import number, one_of
 from .errors import UserError
-from .folders import output_file, write_json
+from .files.entry import number, one_of
+from .files.folders import output_file, write_json
 
 HELD_OUT = "procedural:1000000000..1000000049"
 
@@ -129,10 +129,10 @@ def open_views(
     `take(context, target)` is a dict of what was asked for at generation size, contexts first: rgb [., h, w, 3], K, c2w
     (float64), the targets' depth or None.
     """
-    from .data import scene as scenes
+    from .scenes import scene as scenes
 
     if name.startswith("procedural:"):
-        from .data.procedural import SWEEP, sample_sequence
+        from .procedural.scenes import SWEEP, sample_sequence
 
         made = sample_sequence(
             scenes.procedural_seed(name),
@@ -183,6 +183,7 @@ class Evaluator:
 
         from . import model, sampling
         from .checkpoint import load_model
+        from .sampling.windows import window_noise
         from .video import flow, solvers, vae
 
         self.params, self.config = load_model(checkpoint)
@@ -196,7 +197,7 @@ class Evaluator:
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
-        self.noise = functools.partial(sampling.window_noise, seed, 0, config=config)
+        self.noise = functools.partial(window_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
 
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -245,7 +246,7 @@ def check_scenes(args: argparse.Namespace, names: list[str]) -> None:
     """All that can be said of the scenes before hours are spent on others; procedural ones are right by construction."""
     import warnings
 
-    from .data.scene import load_scene, procedural_seed
+    from .scenes.scene import load_scene, procedural_seed
 
     for name in names:
         if name.startswith("procedural:"):
@@ -349,6 +350,6 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    from .entry import run
+    from .files.entry import run
 
     run(main, parser())

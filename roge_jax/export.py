@@ -15,8 +15,8 @@ import json
 import shutil
 from pathlib import Path
 
-from .entry import number, one_of
-from .folders import put
+from .files.entry import number, one_of
+from .files.folders import put
 
 STYLES = ("diffusers", "peft", "framecrafter", "comfyui")
 FILES = {
@@ -174,7 +174,7 @@ def write_lora(tree, config, style: str, out: Path) -> None:
 
     from .core.params import flatten, unflatten
     from .errors import UserError
-    from .folders import share
+    from .files.folders import share
     from .weights.importer import check_output
     from .weights.lora_export import export_lora
 
@@ -214,6 +214,6 @@ def write_lora(tree, config, style: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    from .entry import run
+    from .files.entry import run
 
     run(main, parser())

@@ -15,9 +15,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from .entry import Clock, environment, number, one_of, run
-from .folders import output_folder, write_json
-from .inputs import (
+from .files.entry import Clock, environment, number, one_of, run
+from .files.folders import output_folder, write_json
+from .sampling.inputs import (
     ALONE,
     MOST_FRAMES,
     SCENE,
@@ -37,7 +37,7 @@ def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
-    from .sampling import DEFAULT_CONTEXT, LONG, SLOTS
+    from .sampling.video import DEFAULT_CONTEXT, LONG, SLOTS
     from .video.flow import SCHEDULES
     from .video.solver_table import SOLVERS
 
@@ -107,8 +107,8 @@ def parser() -> argparse.ArgumentParser:
 
 def write_outputs(folder: Path, result, photos, fps: float) -> None:
     """All files but run.json."""
-    from . import video_io
-    from .geometry.paths import transforms
+    from .files import video_io
+    from .scenes.paths import transforms
 
     height, width = result.frames.shape[1:3]
     names = video_io.write_frames(folder / "frames", result.frames)
@@ -167,7 +167,7 @@ def main(args: argparse.Namespace) -> None:
 
     from . import sampling
     from .core import sharding
-    from .scene_limits import Beside
+    from .sampling.scene_limits import Beside
 
     settings = sampling.Settings(
         steps=args.steps or 0,
@@ -231,8 +231,9 @@ def main(args: argparse.Namespace) -> None:
 
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
-    from . import cost, sampling
+    from . import cost
     from .core import sharding
+    from .sampling.windows import chained
     from .video import solvers
 
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
@@ -270,7 +271,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         m,
         count,
         frames=len(path),
-        later=sum(sampling.chained(m, config)) if settings.long == "chain" else m,
+        later=sum(chained(m, config)) if settings.long == "chain" else m,
         half=dtype == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )

@@ -14,7 +14,7 @@ import dataclasses
 import math
 from pathlib import Path
 
-from .entry import number
+from .files.entry import number
 
 
 def parser() -> argparse.ArgumentParser:
@@ -39,7 +39,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--data",
         type=Path,
-        help="pool written by roge_jax.data.procedural (default: render as we go)",
+        help="pool written by roge_jax.procedural (default: render as we go)",
     )
     p.add_argument(
         "--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)"
@@ -285,6 +285,6 @@ def stage_size(args: argparse.Namespace, stage, cfg):
 
 
 if __name__ == "__main__":
-    from .entry import run
+    from .files.entry import run
 
     run(main, parser())

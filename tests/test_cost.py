@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from roge_jax import cost, fusion, model, programs
+from roge_jax import cost, fusion, model
 from roge_jax.config import preset
 from roge_jax.core.attention import SCORES_BYTES, scores_limit
 from roge_jax.core.params import abstract, count
 from roge_jax.recon import ray_scene, vggt
+from roge_jax.sampling import programs
 from roge_jax.video import dit, vae
 
 PAPER, T = preset("paper"), 1e12

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from scene_files import nerfstudio, truth
 
-from roge_jax import entry, evaluate
+from roge_jax import evaluate
 from roge_jax.checkpoint import save_model
 from roge_jax.config import preset
 from roge_jax.errors import UserError
+from roge_jax.files import entry
 from roge_jax.model import init
 
 
@@ -56,7 +57,7 @@ def test_convention_reaches_the_reader(monkeypatch, tmp_path):
         asked.append(convention)
         raise UserError("seen.")
 
-    monkeypatch.setattr("roge_jax.data.scene.load_scene", stop)
+    monkeypatch.setattr("roge_jax.scenes.scene.load_scene", stop)
     for words, expected in ((["--convention", "opencv"], "opencv"), ([], None)):
         words = [*words, "--scenes", "kitchen", "--out", str(tmp_path / "r.json")]
         assert entry.execute(evaluate.main, evaluate.parser(), words) == 2

@@ -14,7 +14,7 @@ from roge_jax.config import RoGeConfig
 from roge_jax.core.lora import attach
 from roge_jax.core.params import Tree, count, flatten, unflatten
 from roge_jax.core.params import init as init_specs
-from roge_jax.data.procedural import HELDOUT_SEED, sample_sequence
+from roge_jax.procedural.scenes import HELDOUT_SEED, sample_sequence
 from roge_jax.training import loop, stages
 from roge_jax.training.optim import OptimConfig, make_optimiser
 

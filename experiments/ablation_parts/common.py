@@ -10,7 +10,7 @@ import numpy as np
 
 from roge_jax.config import RoGeConfig
 from roge_jax.core.params import Tree, flatten
-from roge_jax.data.procedural import HELDOUT_SEED, sample_sequence
+from roge_jax.procedural.scenes import HELDOUT_SEED, sample_sequence
 from roge_jax.training import stages
 from roge_jax.training.optim import muon_dimensions
 

@@ -17,8 +17,8 @@ from roge_jax import config as configs
 from roge_jax import cost, fusion, model, preview
 from roge_jax.config import RoGeConfig
 from roge_jax.core.params import flatten, unflatten
-from roge_jax.data.procedural import sample_sequence
 from roge_jax.metrics import baselines
+from roge_jax.procedural.scenes import sample_sequence
 from roge_jax.video import dit, flow
 
 from .measures import Judge, difference, summary

@@ -16,9 +16,9 @@ import numpy as np
 
 from roge_jax import model
 from roge_jax.config import RoGeConfig
-from roge_jax.data.procedural import sample_sequence
 from roge_jax.data.views import make_sample
 from roge_jax.evaluate import spread
+from roge_jax.procedural.scenes import sample_sequence
 from roge_jax.video import flow, solvers
 
 CONTEXTS, DEFAULT_M = 6, 3

@@ -20,11 +20,12 @@ import numpy as np
 from timing import measure, where_and_when
 
 from roge_jax import config as presets
-from roge_jax import cost, model, programs
+from roge_jax import cost, model
 from roge_jax.config import RoGeConfig
 from roge_jax.core.params import Tree, fan_in, flatten, init, normal, unflatten, zeros
 from roge_jax.fusion import Condition
 from roge_jax.recon.vggt import encoder_grid
+from roge_jax.sampling import programs
 from roge_jax.training import estimate, stages
 from roge_jax.training.loop import initial_state
 from roge_jax.training.optim import make_optimiser

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from roge_jax.entry import environment
+from roge_jax.files.entry import environment
 
 CLOCKS = "clocks.sm,clocks.mem,power.draw,temperature.gpu,utilization.gpu"
 CLOCKS_SECONDS = 30.0  # at most, for nvidia-smi to answer

@@ -1,5 +1,5 @@
-"""Photos and training data: scene readers, procedural scenes, training samples."""
+"""Training data: pools of sequences, sources, samples of views, faults that photos have."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

@@ -2,7 +2,7 @@
 
     python -m roge_jax.data.pack SCENE .. --out runs/mine --frames 24 --height 64 --width 112
 
-A scene (any layout of `data.readers`) is cut into runs of consecutive views, in the reader's order: a video's frames or
+A scene (any layout of `scenes.readers`) is cut into runs of consecutive views, in the reader's order: a video's frames or
 photos taken while walking. Runs of scenes that have more views than one run overlap by half. Every photo fills the
 picture and is cropped at the centre, K moves along; poses stay in the scene's own frame and unit, since training
 normalises every sample by itself. Each scene is one shard, written under temporary names; its .npz comes last.
@@ -17,10 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from roge_jax.data.scene import Scene, load_scene, prepare
-from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
-from roge_jax.folders import put
+from roge_jax.files.entry import execute, number
+from roge_jax.files.folders import put
+from roge_jax.scenes.scene import Scene, load_scene, prepare
 
 
 def runs(views: int, frames: int) -> list[int]:

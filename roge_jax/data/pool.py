@@ -1,11 +1,10 @@
-"""Pools: many rendered sequences on disk, and the command line of `procedural`.
+"""Pools: many rendered sequences on disk.
 
 A pool is a folder of shards. Shard k is `shard_00000.rgb.npy` (uint8 `[scenes,f,h,w,3]`),
 `shard_00000.depth.npy` (float16, optional) and `shard_00000.npz` (`seeds [scenes]`, `K` and `c2w`
 float64 `[scenes,f,...]`). The .npz is renamed into place last, so a shard with one is complete.
 """
 
-import argparse
 import concurrent.futures
 import contextlib
 import dataclasses
@@ -17,14 +16,12 @@ import time
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from roge_jax.entry import execute, number
 from roge_jax.errors import UserError
-from roge_jax.fields import read_json
-from roge_jax.folders import output_file, put
+from roge_jax.files.fields import read_json
+from roge_jax.files.folders import put
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +75,7 @@ def write_pool(
         UserError: no seeds, seeds of both splits, a folder that holds a pool with other settings
             or that another process is writing.
     """
-    from roge_jax.data.procedural import HELDOUT_SEED, split_of
+    from roge_jax.procedural.scenes import HELDOUT_SEED, split_of
 
     path = Path(path)
     wanted = np.asarray(seeds, np.int64)
@@ -176,7 +173,7 @@ def _is_complete(stem: Path, seeds: np.ndarray) -> bool:
 
 
 def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
-    from roge_jax.data.procedural import sample_sequence
+    from roge_jax.procedural.scenes import sample_sequence
 
     stem, seeds, settings = job
     began = time.perf_counter()
@@ -229,7 +226,7 @@ def read_pool(path: str | Path) -> Pool:
     if not stems:
         raise UserError(
             f"{path} holds no finished shard_*.npz; write one with "
-            f"`python -m roge_jax.data.procedural pool --out {path}`."
+            f"`python -m roge_jax.procedural pool --out {path}`."
         )
     cameras: list[dict[str, np.ndarray]] = []
     pixels: dict[str, list[np.ndarray]] = {"rgb": [], "depth": []}
@@ -258,115 +255,3 @@ def read_pool(path: str | Path) -> Pool:
         starts=np.cumsum([0, *lengths[:-1]]),
         **{name: np.concatenate([entry[name] for entry in cameras]) for name in cameras[0]},
     )
-
-
-def _sheet(
-    out: Path, seeds: Sequence[int], *, views: int, height: int, width: int, **cameras: Any
-) -> None:
-    """A contact sheet: one row of views per scene."""
-    from PIL import Image
-
-    from roge_jax.data.procedural import sample_sequence
-
-    output_file(out, "--out", ".png")
-    rows = []
-    for seed in seeds:
-        scene = sample_sequence(
-            seed, frames=views, height=height, width=width, supersample=3, **cameras
-        )
-        rows.append(np.concatenate(list(scene["rgb"]), 1))
-    half = (len(rows) + 1) // 2  # two scenes beside each other
-    rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
-    sheet = np.concatenate([np.concatenate(rows[:half]), np.concatenate(rows[half:])], 1)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    image = Image.fromarray(sheet).quantize(255, kmeans=2, dither=Image.Dither.NONE)
-    image.save(out, optimize=True)
-    print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]}, {out.stat().st_size} bytes")
-
-
-def _bench(height: int, width: int, frames: int, supersample: int) -> dict:
-    """Frames per second of this process, compilation excluded."""
-    import jax
-
-    from roge_jax.data.procedural import sample_sequence
-
-    options: dict[str, Any] = {"frames": frames, "height": height, "width": width}
-    options |= {"supersample": supersample, "depth": False}
-    began = time.perf_counter()
-    sample_sequence(0, **options)
-    compiled, cpu = time.perf_counter(), time.process_time()
-    count = 0
-    while time.perf_counter() - compiled < 5:
-        count += 1
-        sample_sequence(count, **options)
-    seconds = time.perf_counter() - compiled
-    return {
-        **{k: options[k] for k in ("height", "width", "supersample")},
-        "device": jax.devices()[0].device_kind,
-        "first_call_seconds": round(compiled - began, 2),
-        "frames_per_second": round(count * frames / seconds, 1),
-        "frames_per_cpu_second": round(count * frames / (time.process_time() - cpu), 1),
-    }
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m roge_jax.data.procedural {pool,sheet,bench}`."""
-    parser = argparse.ArgumentParser(prog="python -m roge_jax.data.procedural")
-    commands = parser.add_subparsers(dest="command", required=True)
-    pool = commands.add_parser("pool", help="render many sequences into a folder")
-    pool.add_argument("--out", type=Path, required=True)
-    pool.add_argument("--scenes", type=number(1, 10**7), default=2000)
-    pool.add_argument("--first-seed", type=number(), default=0)
-    pool.add_argument("--processes", type=number(1), default=os.cpu_count() or 1)
-    pool.add_argument("--scenes-per-shard", type=number(1), default=100)
-    pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
-    pool.add_argument(
-        "--varied",
-        action=argparse.BooleanOptionalAction,
-        help="many orbits and lenses (default: for training seeds, not for held-out ones)",
-    )
-    sheet = commands.add_parser("sheet", help="draw a contact sheet")
-    sheet.add_argument("--out", type=Path, required=True)
-    sheet.add_argument("--scenes", type=number(1, 10**7), default=8)
-    sheet.add_argument("--first-seed", type=number(), default=0)
-    sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
-    for command in (pool, sheet):
-        command.add_argument(
-            "--handheld", action="store_true", help="photos from all around, from above, and rolled"
-        )
-    bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
-    for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
-        command.add_argument("--frames", type=number(1), default=frames)
-        command.add_argument("--height", type=number(1), default=64)
-        command.add_argument("--width", type=number(1), default=112)
-    for command in (pool, bench):
-        command.add_argument("--supersample", type=number(1), default=2)
-    for command in (pool, sheet, bench):
-        command.add_argument("--debug", action="store_true", help="show tracebacks")
-    return execute(_run, parser, arguments)
-
-
-def _run(args: argparse.Namespace) -> None:
-    from roge_jax.data.procedural import HELDOUT_SEED
-
-    if args.command == "pool":
-        training = args.first_seed < HELDOUT_SEED
-        write_pool(
-            args.out,
-            range(args.first_seed, args.first_seed + args.scenes),
-            args.frames,
-            args.height,
-            args.width,
-            args.processes,
-            supersample=args.supersample,
-            scenes_per_shard=args.scenes_per_shard,
-            depth=args.depth,
-            varied=training if args.varied is None else args.varied,
-            handheld=args.handheld,
-        )
-    elif args.command == "sheet":
-        seeds = range(args.first_seed, args.first_seed + args.scenes)
-        options = {name: getattr(args, name) for name in ("height", "width", "varied", "handheld")}
-        _sheet(args.out, seeds, views=args.frames, **options)
-    else:
-        print(json.dumps(_bench(args.height, args.width, args.frames, args.supersample)))

@@ -16,7 +16,7 @@ class ProceduralSource:
         return 10**9  # held-out seeds begin here
 
     def __getitem__(self, index: int) -> dict:
-        from .procedural import sample_sequence
+        from ..procedural.scenes import sample_sequence
 
         return sample_sequence(
             index,

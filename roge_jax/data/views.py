@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import UserError
 from ..geometry.cameras import Cameras, camera_vector, normalise
-from .perturb import captured
+from .faults import captured
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class ViewConfig:
     outside: float = 0.2  # probability that contexts surround the window instead of lying in it
     near: float = 0.4  # probability of drawing all views from a short stretch of the path
     augment: bool = True
-    faults: float = 0.0  # probability that photos have those of a capture (`perturb.captured`)
+    faults: float = 0.0  # probability that photos have those of a capture (`faults.captured`)
     size: tuple[int, int] | None = None  # height, width; None: as stored
 
     def undisturbed(self) -> "ViewConfig":

@@ -1,5 +1,5 @@
 """Cameras, rays, crops, camera paths and how frames become latent slots. No parameters."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

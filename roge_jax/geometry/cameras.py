@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.fields import number
+from roge_jax.files.fields import number
 from roge_jax.geometry.crops import crop_resize, crop_resize_K, resize, scale_K, shift_K, turn
 from roge_jax.geometry.validation import FARTHEST, Finding, inspect_arrays
 
@@ -400,3 +400,11 @@ def validate(
         more = f"{len(findings) - MOST_WARNINGS} more like these: run python -m roge_jax.check."
         warnings.warn(more, CameraWarning, stacklevel=2)
     return cameras
+
+
+def scale_focal(cameras: Cameras, factor: float) -> Cameras:
+    """Both focal lengths (and skew) times `factor`; the principal point stays."""
+    cameras = to_host(cameras)
+    K = cameras.K.copy()
+    K[:, :2, :2] *= factor
+    return Cameras(K, cameras.c2w)

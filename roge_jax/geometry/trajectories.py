@@ -13,17 +13,15 @@ from typing import Any
 import numpy as np
 
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.fields import number
+from roge_jax.files.fields import number
 from roge_jax.geometry.cameras import Cameras, checked_views, to_host
-from roge_jax.geometry.paths import interpolate, load_path, save_path
+from roge_jax.geometry.interpolation import interpolate
 
 __all__ = [
     "PRESETS",
     "focus_distance",
-    "load_path",
     "make_path",
     "parse_options",
-    "save_path",
     "world_up",
 ]
 

@@ -1,5 +1,5 @@
 """What is measured and what it is compared with. docs/metrics.md defines every number."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

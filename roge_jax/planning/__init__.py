@@ -1,5 +1,5 @@
 """No more model than a scene needs: what a run may leave out for a tolerance. docs/planning.md explains it."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

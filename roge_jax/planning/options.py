@@ -12,14 +12,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from .. import cost
-from ..choices import Choices, around
 from ..config import RoGeConfig
-from ..data import coverage
 from ..errors import UserError
 from ..geometry.cameras import Cameras
-from ..sampling import Photos, Settings
+from ..sampling.choices import Choices, around
+from ..sampling.video import Photos, Settings
+from ..sampling.windows import chained, windows
+from ..scenes import coverage
 from ..video import flow, solvers
-from ..windows import chained, windows
 from . import proxies, stretches
 from .table import Table
 from .table import scale as factor

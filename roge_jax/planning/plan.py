@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import cost
-from ..choices import Choices
 from ..config import RoGeConfig
 from ..core.params import Tree
-from ..data import coverage
-from ..data.scene import Scene
 from ..errors import UserError
 from ..geometry.cameras import Cameras
-from ..sampling import Photos, Settings, read_photos
+from ..sampling.choices import Choices
+from ..sampling.video import Photos, Settings, read_photos
+from ..scenes import coverage
+from ..scenes.scene import Scene
 from . import proxies
 from .options import Option, choose, full_choices, list_options, next_best, trail
 from .table import Table, load

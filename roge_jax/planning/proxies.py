@@ -14,14 +14,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import cost, model, programs, sampling
+from .. import cost, model
 from ..config import RoGeConfig
 from ..core.params import Tree
 from ..geometry.cameras import Cameras, normalise
 from ..recon.ray_scene import merge_scene
 from ..recon.vggt import encoder_grid
+from ..sampling import programs
+from ..sampling.video import Photos, Settings
+from ..sampling.windows import window_noise, window_views
 from ..video import flow, solvers
-from ..windows import window_views
 
 PROBE_STEPS = 2  # and twice as many
 LEFT_OUT = 2  # photos, evenly spread: more say little more and cost as much again
@@ -38,9 +40,9 @@ class Measured:
 def measure(
     params: Tree,
     config: RoGeConfig,
-    photos: sampling.Photos,
+    photos: Photos,
     path: Cameras,
-    settings: sampling.Settings,
+    settings: Settings,
     most: float,
     compiled: dict[Any, Any],
 ) -> Measured:
@@ -90,7 +92,7 @@ def left_out(m: int) -> list[int]:
 
 
 def leave_one_out(
-    params: Tree, config: RoGeConfig, photos: sampling.Photos, compiled: dict[Any, Any]
+    params: Tree, config: RoGeConfig, photos: Photos, compiled: dict[Any, Any]
 ) -> dict[str, float]:
     """The proxies leave_one_out, over the photos left out together, and redundancy: the share of the scene tokens'
     energy that averaging 2 x 2 neighbours takes away (0: neighbours are equal). Two photos or more."""
@@ -137,9 +139,9 @@ def richardson_price(config: RoGeConfig, m: int) -> float:
 def richardson(
     params: Tree,
     config: RoGeConfig,
-    photos: sampling.Photos,
+    photos: Photos,
     path: Cameras,
-    settings: sampling.Settings,
+    settings: Settings,
     compiled: dict[Any, Any],
 ) -> float:
     """How far two steps are from four, in latents."""
@@ -149,7 +151,7 @@ def richardson(
     )
     views = window_views(photos.images, None, context, target[: config.frames], info, config)
     m = len(photos.ids)
-    noise = jnp.asarray(sampling.window_noise(settings.seed, 0, m, config))
+    noise = jnp.asarray(window_noise(settings.seed, 0, m, config))
     key = ("richardson", m, small, settings.slots)
     if key not in compiled:
         compiled[key] = jax.jit(functools.partial(_two_runs, config=small, slots=settings.slots))

@@ -10,10 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..choices import Span
 from ..config import RoGeConfig
 from ..geometry.packing import GROUP
-from ..windows import windows
+from ..sampling.choices import Span
+from ..sampling.windows import windows
 
 COUNTS = 32  # numbers of windows that are tried on long paths
 

@@ -1,5 +1,5 @@
 """The reconstruction half: camera-conditioned VGGT and the ray-scene transformer."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

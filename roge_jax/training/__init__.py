@@ -1,5 +1,5 @@
 """Training: optimisers, the stages and their losses, the loop that survives bad steps and restarts."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

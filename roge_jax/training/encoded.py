@@ -21,7 +21,7 @@ from .. import fusion, model, preview
 from ..config import RoGeConfig
 from ..core.params import Tree
 from ..errors import UserError
-from ..folders import put
+from ..files.folders import put
 from ..geometry.rays import plucker
 
 Clip = dict[str, jax.Array]

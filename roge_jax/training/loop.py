@@ -28,7 +28,7 @@ from ..core import sharding
 from ..core.distributed import global_batch, is_main
 from ..core.params import Tree
 from ..errors import UserError
-from ..folders import put
+from ..files.folders import put
 from .optim import OptimConfig, ema_update, make_optimiser
 
 

@@ -15,7 +15,7 @@ from ..config import RoGeConfig
 from ..core import sharding
 from ..core.memory import DEVICE, HOST, memory_available, own_memory, refuse
 from ..core.params import count
-from ..folders import check_disk
+from ..files.folders import check_disk
 from . import estimate, loop
 from .stages import Stage, stage_specs
 

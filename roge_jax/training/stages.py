@@ -412,8 +412,8 @@ def held_out(
 
     `encode`: from the arrays of one sample to those that the objective takes; None: as they are.
     """
-    from ..data.procedural import HELDOUT_SEED
     from ..data.source import ProceduralSource
+    from ..procedural.scenes import HELDOUT_SEED
 
     frames = max(24, config.frames + 3)
     source = ProceduralSource(config.height, config.width, frames)

@@ -17,7 +17,7 @@ from ..core.params import Tree, loaded
 from ..cost import kept_as
 from ..data.source import open_source
 from ..errors import UserError
-from ..folders import fingerprint_files, keep_settings
+from ..files.folders import fingerprint_files, keep_settings
 from . import encoded, stages
 from .stages import Stage, stage_config
 

@@ -6,7 +6,7 @@
 
 `velocity(x, sigma)` takes the state and a scalar noise level (a network multiplies it by 1000). The
 state is float32 whatever the velocity's dtype: a bfloat16 state gets *worse* with more steps once
-the steps fall below its rounding (tests/test_solvers.py). The first non-finite number stops the
+the steps fall below its rounding (tests/video/test_solvers.py). The first non-finite number stops the
 network from being called again; `info` says where. Everything here may be jitted; a `Table` passed
 as an argument makes one compilation serve every grid of its length.
 """

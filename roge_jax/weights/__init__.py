@@ -1,5 +1,5 @@
 """Published weights: the only place that knows the names of other code. docs/weights.md explains it."""
 
-from ..lazy import submodules
+from ..core.lazy import submodules
 
 __getattr__, __dir__ = submodules(__name__)

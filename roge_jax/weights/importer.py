@@ -21,7 +21,7 @@ import numpy as np
 from ..config import RoGeConfig, VAEConfig, to_dict
 from ..core.params import Spec, flatten, init, unflatten
 from ..errors import UserError
-from ..folders import check_disk, put
+from ..files.folders import check_disk, put
 from ..video.dit import FLOAT32_LEAVES
 from ..video.vae_training import passthrough_init
 from .mapping import Entry, source_shapes

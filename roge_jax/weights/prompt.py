@@ -11,7 +11,7 @@ import numpy as np
 from ..config import DiTConfig
 from ..core import memory
 from ..errors import UserError
-from ..fields import is_file, read_json
+from ..files.fields import is_file, read_json
 from .sources import open_source
 
 WEIGHTS = ("model.safetensors", "model.safetensors.index.json")  # whole, or in shards

@@ -1,0 +1,190 @@
+"""What the options of `python -m roge_jax.sample` mean: configuration, scene, photos, path, devices and weights."""
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from ..files.fields import is_file
+
+SCENE, MOST_FRAMES = "motorcycle", 10000  # frames/0000.png to 9999.png, in memory at once
+MOST_PIXELS = 2**24  # of a picture
+RENDERED = 32  # views of a procedural scene
+THROUGH = "interpolate:order=shortest"  # the path of several photos
+ALONE = "orbit:degrees=12"  # and of one
+LARGE = 1e9  # parameters from which `auto` means bfloat16 on an accelerator
+
+
+def model_config(args: argparse.Namespace, *, weights: bool):
+    """The configuration of --checkpoint at --size; a preset without weights is enough for a dry run."""
+    from ..checkpoint import find_model, load_config
+    from ..config import PRESETS, preset
+
+    try:
+        config = load_config(find_model(args.checkpoint))
+    except UserError:
+        if weights or args.checkpoint not in PRESETS:
+            raise
+        config = preset(args.checkpoint)
+    if args.size is None:
+        return config
+    try:
+        height, width = (int(side) for side in args.size.lower().split("x"))
+    except ValueError:
+        raise UserError(
+            f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}."
+        ) from None
+    if height > 0 and width > 0 and height * width > MOST_PIXELS:
+        raise UserError(
+            f"--size {args.size}: give at most {MOST_PIXELS} pixels, e.g. 4096x4096; this model was made for "
+            f"{config.height}x{config.width}."
+        )
+    patch = config.renderer.patch
+    ratio = config.recon_height / config.height, config.recon_width / config.width
+    return dataclasses.replace(
+        config,
+        height=height,
+        width=width,
+        recon_height=max(patch, round(height * ratio[0] / patch) * patch),
+        recon_width=max(patch, round(width * ratio[1] / patch) * patch),
+    )
+
+
+def camera_path(args: argparse.Namespace, context, config):
+    """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video."""
+    from ..geometry.cameras import Cameras
+    from ..geometry.trajectories import PRESETS, make_path, parse_options
+    from ..scenes.paths import load_path
+
+    _check_length(args.frames or 0, f"--frames {args.frames}")
+    if args.trajectory is None:
+        args.trajectory = THROUGH if len(context) > 1 else ALONE
+    name, _, words = args.trajectory.partition(":")
+    if is_path_file(args.trajectory):
+        if args.start:
+            raise UserError(
+                f"--start {args.start} is for presets: a path file starts where it says; leave it away."
+            )
+        size = {"height": config.height, "width": config.width}
+        path = load_path(args.trajectory, frames=args.frames, context=context, **size)
+        _check_length(len(path), args.trajectory)
+    elif name not in PRESETS and ("/" in name or "." in name):
+        raise UserError(f"--trajectory {args.trajectory}: there is no such path file.")
+    else:
+        options = parse_options(words, f"--trajectory {args.trajectory}")
+        if args.start and "start" in options:
+            raise UserError(
+                f"--trajectory {args.trajectory}: 'start' is given twice, with --start {args.start}."
+            )
+        path = make_path(
+            name, context, args.frames or config.frames, **({"start": args.start} | options)
+        )
+    if args.fov is not None:
+        if not args.fov < 180:
+            raise UserError(
+                f"--fov {args.fov:g}: the full vertical angle must lie between 0 and 180 degrees."
+            )
+        focal = 0.5 * config.height / np.tan(np.radians(args.fov) / 2)
+        K = np.array([[focal, 0, config.width / 2], [0, focal, config.height / 2], [0, 0, 1.0]])
+        path = Cameras(np.repeat(K[None], len(path), 0), path.c2w)
+    return path
+
+
+def is_path_file(trajectory: str | None) -> bool:
+    """Whether a --trajectory is a file of cameras, which are known before any photo is."""
+    return trajectory is not None and (
+        trajectory.lower().endswith(".json") or is_file(Path(trajectory))
+    )
+
+
+def _check_length(frames: int, where: str) -> None:
+    if frames > MOST_FRAMES:
+        raise UserError(
+            f"{where}: give a path of at most {MOST_FRAMES} frames, since all are in memory until they are written."
+        )
+
+
+def large_dtype(args: argparse.Namespace, parameters: float) -> str:
+    """The dtype of large matrices that --dtype means for a model of so many parameters."""
+    import jax
+
+    if args.dtype != "auto":
+        return args.dtype
+    return "bfloat16" if parameters > LARGE and jax.default_backend() != "cpu" else "float32"
+
+
+def sampling_mesh(args: argparse.Namespace):
+    """The mesh of --mesh and --devices, None for one device. Call it before anything asks JAX for devices."""
+    from ..core import distributed, sharding
+
+    sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
+    if sizes.get("data", 1) > 1:
+        raise UserError(
+            f"--mesh {args.mesh}: one video has no scenes to split over data: use fsdp (weights) and seq (tokens)."
+        )
+    count = args.devices or sizes.get("fsdp", 1) * sizes.get("seq", 1)
+    if count == 1:
+        return None
+    distributed.request_devices(count)
+    import jax
+
+    devices = jax.devices()[:count]
+    sizes = sizes or {"seq": len(devices)}
+    return sharding.make_mesh(**{"data": 1} | sizes, devices=devices)
+
+
+def load_weights(args: argparse.Namespace, mesh=None):
+    """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+    import jax
+
+    from .. import checkpoint, cost, model
+    from ..core import sharding
+    from ..core.params import count
+
+    config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
+    specs = model.specs(config)
+    if jax.default_backend() == "gpu":
+        sharding.check_heads(config.dit.heads, mesh)
+    dtype = large_dtype(args, count(specs))
+    return checkpoint.load_model(
+        args.checkpoint,
+        dtype=cost.kept_as(dtype),
+        shardings=None if mesh is None else sharding.shardings(specs, mesh),
+    )
+
+
+def read_inputs(args: argparse.Namespace, config, settings, scene=None):
+    """(scene, photos, path), after all checks that need no weights; `settings` are those of the model.
+
+    Of a path file photos are chosen that see what it looks at; a preset starts from photos that are chosen before it.
+    """
+    from ..geometry.cameras import normalise
+    from ..scenes.scene import cameras_at, load_scene
+    from .video import context_ids, noise_levels, read_photos
+
+    scene = scene or load_scene(args.scene, convention=args.convention)
+    known = None
+    if is_path_file(args.trajectory):
+        known = camera_path(args, cameras_at(scene, config.height, config.width), config)
+    photos = read_photos(scene, context_ids(args.context, scene, config, known), config)
+    path = camera_path(args, photos.cameras, config)
+    normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
+    noise_levels(settings, config)
+    return scene, photos, path
+
+
+def stand_in(args: argparse.Namespace, config):
+    """A blank scene where the one asked for takes a minute to render (procedural), or none was chosen and the built-in
+    one has fewer photos than --context asks for; else None."""
+    from ..procedural.scenes import split_of
+    from ..scenes.scene import procedural_seed
+    from .video import blank_scene
+
+    if args.scene.startswith("procedural:"):
+        split_of(procedural_seed(args.scene))  # raises for a seed out of range
+        return blank_scene(args.scene, RENDERED, config)
+    count = int(args.context) if (args.context or "").isdecimal() else 0
+    asked = args.scene == SCENE and 2 < count <= config.max_context
+    return blank_scene(SCENE, count, config) if asked else None

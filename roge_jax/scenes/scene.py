@@ -1,0 +1,398 @@
+"""A scene: posed photographs, from a folder or built in, ready for the model."""
+
+import dataclasses
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from roge_jax.errors import UserError, did_you_mean
+from roge_jax.files.fields import exists, number
+from roge_jax.geometry.cameras import (
+    Cameras,
+    CameraWarning,
+    crop_resize,
+    crop_resize_K,
+    scale_K,
+    to_host,
+    turn,
+    validate,
+)
+from roge_jax.geometry.validation import Finding
+from roge_jax.scenes.images import QUARTER_TURNS, Frame, Header, Photo, Photos, ideal_K, read_header
+from roge_jax.scenes.readers import read_frames
+
+__all__ = [
+    "Scene",
+    "cameras_at",
+    "distinct_views",
+    "load_scene",
+    "open_scene",
+    "prepare",
+    "select_context",
+    "view_gaps",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Posed photos. Cameras are float64 NumPy, OpenCV camera-to-world, K in pixels of its photo.
+
+    images: a sequence of float32 RGB [h, w, 3] in [0, 1], decoded on access when they are files;
+      sizes may differ. depths: z-depth [h, w] per view in the scene's unit where it is known, NaN
+      where it is not. notes: what reading changed or assumed, as findings.
+    """
+
+    images: Sequence[np.ndarray]
+    cameras: Cameras
+    names: tuple[str, ...]
+    source: str
+    depths: Sequence[np.ndarray] | None = None
+    notes: tuple[Finding, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(height, width) of every photo, without decoding files."""
+        if isinstance(self.images, Photos):
+            return self.images.sizes
+        return [(image.shape[0], image.shape[1]) for image in self.images]
+
+
+def load_scene(spec: str | Path, **options: Any) -> Scene:
+    """A scene whose cameras have passed `validate`.
+
+    Args:
+      spec: a folder or file in one of the layouts of `scenes.readers`; "motorcycle" (a real stereo
+        pair that ships with scikit-image); "procedural:SEED" (rendered).
+      options: see `open_scene`.
+    Raises: UserError naming the file, the view and the field.
+    """
+    scene = open_scene(spec, **options)
+    for note in scene.notes:
+        if note.severity == "warning":
+            warnings.warn(str(note), CameraWarning, stacklevel=2)
+    heights, widths = zip(*scene.sizes, strict=True)
+    try:
+        cameras = validate(scene.cameras, heights, widths, scene.names)
+    except UserError as error:
+        raise UserError(f"{scene.source}: {error}") from None
+    return dataclasses.replace(scene, cameras=cameras)
+
+
+def open_scene(
+    spec: str | Path,
+    *,
+    convention: str | None = None,
+    exif: str = "auto",
+    background: float = 1.0,
+    camera: int = 0,
+    frames: int = 32,
+    height: int = 192,
+    width: int = 336,
+    supersample: int = 2,
+) -> Scene:
+    """A scene as it is, its cameras unchecked (`check` uses this to report all that is wrong).
+
+    Args:
+      convention: axes of the poses of a `transforms.json` if they are not OpenGL.
+      exif: "auto" turns photos upright as their EXIF tag says (poses and K too, if K is plainly for
+        the stored grid), "ignore" takes the stored grid.
+      background: what transparent pixels show, 1 is white.
+      camera: which of Virtual KITTI 2's two cameras.
+      frames, height, width, supersample: of procedural scenes.
+    """
+    name = str(spec)
+    if name == "motorcycle":
+        return _motorcycle()
+    if name.startswith("procedural:"):
+        return _procedural(name, frames, height, width, supersample)
+    if exif not in ("auto", "ignore"):
+        raise UserError(f"exif='{exif}': {did_you_mean(exif, ('auto', 'ignore'))}")
+    if not 0 <= background <= 1:
+        raise UserError(f"background={background}: give a grey from 0 (black) to 1 (white).")
+    if not name or (not exists(Path(spec)) and "/" not in name and "." not in name):
+        hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
+        raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
+    found = read_frames(Path(spec), convention=convention, camera=camera)
+    return _assemble(found, name, exif, background)
+
+
+def is_nerfstudio(source: str) -> bool:
+    """Whether a scene was read from a `transforms.json`, the only layout whose axes have to be believed."""
+    path = Path(source)
+    return path.suffix == ".json" or (path / "transforms.json").is_file()
+
+
+def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:
+    """Frames to a scene: sizes, orientation, scale of K, lens. Pixels are not decoded yet."""
+    photos, Ks, poses = [], [], []
+    notes: dict[str, Finding] = {}
+
+    def note(severity: str, what: str, fix: str) -> None:
+        notes.setdefault(what, Finding(severity, source, what, fix))
+
+    for frame in frames:
+        header = read_header(frame.file)
+        use_tag, turns = _orientation(header, frame, exif)
+        size = header.displayed if use_tag else header.stored
+        K, pose = _fit_K(frame, size), frame.c2w
+        photo = Photo(frame.file, size, use_tag, turns, background=background)
+        if frame.lens is not None and np.isfinite(K).all():
+            new_K = _straightened_K(K, frame, size)
+            photo = dataclasses.replace(photo, lens=frame.lens, K=K, new_K=new_K)
+            K = new_K
+            note("note", f"photos have {frame.lens.model} lens distortion", "it is removed")
+        if turns:
+            K, pose = turn(K, pose, turns, *size)
+            upright = size[::-1] if turns % 2 else size
+            photo = dataclasses.replace(photo, size=upright)
+        if header.alpha:
+            note("warning", "photos are transparent", f"they show background {background:g} there")
+        if header.orientation != 1:
+            note("note", "photos carry an EXIF orientation", "see docs/cameras.md if they lie down")
+        if frame.size not in (None, size, (1, 1)):
+            what = f"intrinsics are for {frame.size[1]} x {frame.size[0]} pixels"
+            note("note", what, f"they are scaled to the photos, {size[1]} x {size[0]}")
+        photos.append(photo)
+        Ks.append(K)
+        poses.append(pose)
+    names = tuple(frame.file.name for frame in frames)
+    cameras = Cameras(np.stack(Ks), np.stack(poses))
+    return Scene(Photos(photos), cameras, names, source, notes=tuple(notes.values()))
+
+
+def _straightened_K(K: np.ndarray, frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    assert frame.lens is not None
+    new_K = ideal_K(K, frame.lens, size)
+    zoom = new_K[[0, 1], [0, 1]] / np.maximum(np.abs(K[[0, 1], [0, 1]]), 1e-300)
+    if not (np.isfinite(new_K).all() and (zoom > 0.02).all() and (zoom < 50).all()):
+        raise UserError(
+            f"{frame.file}: lens coefficients {frame.lens.coefficients} leave no usable picture (the focal length "
+            f"would change by a factor of {zoom[0]:.3g}): check them."
+        )
+    return new_K
+
+
+def _orientation(header: Header, frame: Frame, exif: str) -> tuple[bool, int]:
+    """(apply the EXIF tag while decoding, quarter turns of picture and camera afterwards).
+
+    K is taken to be for the upright picture unless its size fits only the stored grid; then the
+    poses belong to that grid too, and picture, K and pose are turned together.
+    """
+    if exif == "ignore":
+        return False, 0
+    if frame.size in (None, (1, 1)) or header.orientation < 5:
+        return True, 0
+    assert frame.size is not None
+    height, width = frame.size
+    for_stored = _aspect_gap((height, width), header.stored) < 0.02
+    for_upright = _aspect_gap((height, width), header.displayed) < 0.02
+    if for_upright or not for_stored:
+        return True, 0
+    # A mirrored picture (5, 7) is no camera's picture: it stays on its grid.
+    return False, QUARTER_TURNS.get(header.orientation, 0)
+
+
+def _aspect_gap(a: tuple[int, int], b: tuple[int, int]) -> float:
+    return abs((a[1] / a[0]) / (b[1] / b[0]) - 1.0)
+
+
+def _fit_K(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """K in pixels of the picture of this size, whatever size the file says it is for."""
+    if frame.size is None or frame.size == size:
+        return frame.K
+    if frame.size != (1, 1) and _aspect_gap(frame.size, size) > 0.02:
+        raise UserError(
+            f"{frame.file}: is {size[1]} x {size[0]} pixels but its intrinsics are for "
+            f"{frame.size[1]} x {frame.size[0]}: correct 'w' and 'h', or do not crop the photo."
+        )
+    return scale_K(frame.K, frame.size, size)
+
+
+def _motorcycle() -> Scene:
+    """Middlebury 2014 "Motorcycle", quarter size: two photos 193.001 mm apart, world in metres.
+
+    Calibration from scikit-image's documentation. Middlebury counts pixel centres as whole numbers
+    at full size, so the principal point moves by (0.5 px) / 4. The right camera's principal point
+    lies 31.086 px further right; z-depth = focal * baseline / (disparity + 31.086).
+    """
+    from skimage import data
+
+    left, right, disparity = data.stereo_motorcycle()
+    focal, cx, cy, dx, baseline = 994.978, 311.193, 254.877, 31.086, 0.193001
+    K = np.array([[focal, 0.0, cx + 0.125], [0.0, focal, cy + 0.125], [0.0, 0.0, 1.0]])
+    second = K.copy()
+    second[0, 2] += dx
+    c2w = np.tile(np.eye(4), (2, 1, 1))
+    c2w[1, 0, 3] = baseline
+    disparity = np.where(np.isfinite(disparity), disparity, np.nan).astype(np.float64)
+    depth = (focal * baseline / (disparity + dx)).astype(np.float32)
+    images = [np.asarray(image, np.float32) / np.float32(255) for image in (left, right)]
+    unknown = np.full_like(depth, np.nan)
+    cameras = Cameras(np.stack([K, second]), c2w)
+    return Scene(images, cameras, ("left", "right"), "motorcycle", depths=[depth, unknown])
+
+
+def procedural_seed(name: str) -> int:
+    """The seed of "procedural:SEED"."""
+    digits = name.removeprefix("procedural:")
+    if not digits.removeprefix("-").isdecimal():
+        raise UserError(f"'{name}': the seed must be a whole number, e.g. procedural:7.")
+    return int(digits)
+
+
+def _procedural(name: str, frames: int, height: int, width: int, supersample: int) -> Scene:
+    from roge_jax.procedural import scenes as procedural
+
+    seed = procedural_seed(name)
+    made = procedural.sample_sequence(
+        seed, frames=frames, height=height, width=width, supersample=supersample
+    )
+    images = [np.asarray(image, np.float32) / np.float32(255) for image in np.asarray(made["rgb"])]
+    names = tuple(f"{i:04d}" for i in range(len(images)))
+    cameras = to_host(Cameras(made["K"], made["c2w"]))
+    return Scene(images, cameras, names, name, depths=list(np.asarray(made["depth"])))
+
+
+def cameras_at(scene: Scene, height: int, width: int) -> Cameras:
+    """The cameras of all views as `prepare` returns them, without reading a photo."""
+    sizes = zip(scene.cameras.K, scene.sizes, strict=True)
+    K = [crop_resize_K(K, size, (height, width)) for K, size in sizes]
+    return Cameras(np.stack(K), scene.cameras.c2w)
+
+
+def prepare(
+    scene: Scene,
+    ids: Sequence[int],
+    height: int,
+    width: int,
+    *,
+    drop_duplicates: bool = True,
+) -> tuple[np.ndarray, Cameras]:
+    """Views of a scene at one size: images float32 [k, height, width, 3], cameras with K to match.
+
+    Every photo fills the picture and is cropped at the centre; K moves along. A view given twice
+    (same pose and pixels) is kept once, with a CameraWarning.
+    Raises: UserError for views that do not exist, and for photos whose aspect ratios differ by more
+      than a factor of two (one crop would show what the other lacks).
+    """
+    ids = [number(i, scene.source, "view", whole=True) for i in ids]
+    if not len(scene.images) == len(scene.cameras) == len(scene):
+        raise UserError(
+            f"{scene.source}: {len(scene.images)} images, {len(scene.cameras)} cameras and {len(scene)} names: "
+            "give one of each per view."
+        )
+    for i in ids:
+        if not 0 <= i < len(scene):
+            raise UserError(f"{scene.source}: there is no view {i}: it has {len(scene)}, from 0.")
+    if not ids:
+        raise UserError(f"{scene.source}: no views were chosen: give at least one.")
+    if not isinstance(scene.images, Photos):
+        for i in ids:
+            _check_pixels(scene.images[i], f"{scene.source}, view {i} ({scene.names[i]})")
+    aspects = [scene.sizes[i][1] / scene.sizes[i][0] for i in ids]
+    if max(aspects) > 2 * min(aspects):
+        wide, tall = ids[int(np.argmax(aspects))], ids[int(np.argmin(aspects))]
+        raise UserError(
+            f"{scene.source}: photos {scene.names[wide]} and {scene.names[tall]} differ by more "
+            "than a factor of two in aspect ratio: crop them alike, or choose other views."
+        )
+    images, Ks = [], []
+    for i in ids:
+        image, K = crop_resize(scene.images[i], scene.cameras.K[i], height, width)
+        images.append(image)
+        Ks.append(K)
+    pictures, cameras = np.stack(images), Cameras(np.stack(Ks), scene.cameras.c2w[ids])
+    if drop_duplicates:
+        kept = distinct_views(pictures, cameras)
+        if len(kept) < len(ids):
+            gone = [scene.names[ids[i]] for i in range(len(ids)) if i not in kept]
+            message = f"{scene.source}: same pose and picture as another view: {', '.join(gone)}."
+            warnings.warn(message, CameraWarning, stacklevel=2)
+            pictures, cameras = pictures[kept], cameras[kept]
+    return pictures, cameras
+
+
+def _check_pixels(image: Any, where: str) -> None:
+    """Raise UserError unless an image given as an array is [h, w, 3], uint8 or float in [0, 1]."""
+    shape, dtype = getattr(image, "shape", None), np.dtype(getattr(image, "dtype", object))
+    if shape is None or len(shape) != 3 or shape[-1] != 3 or 0 in shape:
+        given = type(image).__name__ if shape is None else f"shape {tuple(shape)}"
+        raise UserError(f"{where}: the image is given as {given}: give an RGB array [h, w, 3].")
+    if dtype == np.uint8:
+        return
+    low, high = (float(np.min(image)), float(np.max(image))) if dtype.kind == "f" else (0.0, np.inf)
+    if not (low >= -1e-3 and high <= 1.001):  # NaN fails too
+        span = f" from {low:.4g} to {high:.4g}" if dtype.kind == "f" else ""
+        raise UserError(
+            f"{where}: the image has {dtype} values{span}: give uint8, or floats from 0 to 1."
+        )
+
+
+def distinct_views(images: Sequence[np.ndarray] | np.ndarray, cameras: Cameras) -> list[int]:
+    """Indices of the views left when of views with equal pose, K and pixels the first is kept."""
+    cameras = to_host(cameras)
+    kept: list[int] = []
+    for view in range(len(cameras)):
+        same = (
+            other
+            for other in kept
+            if np.array_equal(cameras.c2w[view], cameras.c2w[other])
+            and np.array_equal(cameras.K[view], cameras.K[other])
+            and np.array_equal(images[view], images[other])
+        )
+        if next(same, None) is None:
+            kept.append(view)
+    return kept
+
+
+def view_gaps(cameras: Cameras) -> np.ndarray:
+    """How different what two views see is, [v, v], for `select_context`: their distance over the largest one and their
+    angle over the largest one, added in squares.
+    """
+    apart = np.linalg.norm(cameras.centres[:, None] - cameras.centres[None], axis=-1)
+    rotations = cameras.c2w[:, :3, :3]
+    traces = np.einsum("aij,bij->ab", rotations, rotations)
+    angles = np.arccos(np.clip((traces - 1.0) / 2.0, -1.0, 1.0))
+    # What is only rounding (of positions, and of arccos near 1) must not be scaled up to 1.
+    limits = (1e-12 * np.abs(cameras.centres).max(), 1e-6)
+    return np.sqrt(
+        sum(
+            (gap / gap.max()) ** 2 if gap.max() > limit else 0.0 * gap
+            for gap, limit in zip((apart, angles), limits, strict=True)
+        )
+    )
+
+
+def select_context(
+    scene: Scene | Cameras, m: int, *, first: int | None = None, among: Sequence[int] | None = None
+) -> list[int]:
+    """m views that see as much of the scene as possible: farthest-point sampling, deterministic.
+
+    How far apart views are says `view_gaps`, in no unit. The first view is the most central one
+    unless `first` is given. `among` limits the choice. Returns indices in ascending order, except
+    that `first` leads (it becomes the world frame).
+    """
+    cameras = to_host(scene.cameras if isinstance(scene, Scene) else scene)
+    pool = list(range(len(cameras))) if among is None else [int(i) for i in among]
+    for i in pool:
+        if not 0 <= i < len(cameras):
+            raise UserError(f"Cannot choose among view {i}: there are {len(cameras)}, from 0.")
+    if not isinstance(m, int | np.integer) or not 1 <= m <= len(pool):
+        raise UserError(f"Cannot choose {m} context views: the scene offers 1 to {len(pool)}.")
+    if first is not None and first not in pool:
+        raise UserError(f"View {first} cannot be the first context: it is not among the choices.")
+    distances = view_gaps(cameras[pool])
+    start = int(np.argmin(distances.sum(0))) if first is None else pool.index(first)
+    picked = [start]
+    while len(picked) < m:
+        nearest = distances[:, picked].min(1)
+        nearest[picked] = -1.0
+        picked.append(int(np.argmax(nearest)))
+    ids = sorted(pool[i] for i in picked)
+    return ids if first is None else [first, *(i for i in ids if i != first)]
