@@ -238,14 +238,19 @@ def pose_agreement(
     first = next(iter(candidates.values()))
     medians: dict[str, list[float]] = {name: [] for name in candidates}
     for i, j in neighbour_pairs(first, count):
-        image_i, K_i = shrink(images[i], first.K[i])
-        image_j, K_j = shrink(images[j], first.K[j])
+        image_i, _ = shrink(images[i], first.K[i])
+        image_j, _ = shrink(images[j], first.K[j])
         matches = matched_features(features(image_i), features(image_j))
         if matches is None:
             continue
         for name, cameras in candidates.items():
-            a = Cameras(K_i[None], cameras.c2w[i : i + 1])
-            b = Cameras(K_j[None], cameras.c2w[j : j + 1])
+            a = Cameras(_at(cameras.K[i], images[i], image_i)[None], cameras.c2w[i : i + 1])
+            b = Cameras(_at(cameras.K[j], images[j], image_j)[None], cameras.c2w[j : j + 1])
             medians[name].append(float(np.median(epipolar_distances(*matches, a, b))))
     used = len(next(iter(medians.values())))
     return {n: float(np.median(v)) if v else float("nan") for n, v in medians.items()}, used
+
+
+def _at(K: np.ndarray, image: np.ndarray, smaller: np.ndarray) -> np.ndarray:
+    """K of a photo in pixels of its smaller copy."""
+    return scale_K(K, (image.shape[0], image.shape[1]), (smaller.shape[0], smaller.shape[1]))
