@@ -56,10 +56,11 @@ def model_config(args: argparse.Namespace, *, weights: bool):
     )
 
 
-def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = False):
+def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = False, start=None):
     """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video; --fps where only the file says it.
 
-    quiet: what is to be said about the file has been said.
+    quiet: what is to be said about the file has been said. start: the pose [4, 4] of the photo at which a path starts
+    that is relative to its first camera; the first of `context` if None.
     """
     from ..geometry.cameras import Cameras
     from ..geometry.trajectories import PRESETS, make_path, parse_options
@@ -77,8 +78,15 @@ def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = Fals
         size = {"height": config.height, "width": config.width}
         place = None if args.scene == SCENE or args.scene.startswith("procedural:") else args.scene
         axes = {"convention": args.convention, "frame": getattr(args, "path_frame", None)}
+        if start is not None:
+            leader = Cameras(context.K[:1], start[None])
         read = read_path(
-            args.trajectory, frames=args.frames, context=context, scene=place, **axes, **size
+            args.trajectory,
+            frames=args.frames,
+            context=context if start is None else leader,
+            scene=place,
+            **axes,
+            **size,
         )
         path = read.cameras
         _check_length(len(path), args.trajectory)
@@ -203,13 +211,15 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
     from .video import context_ids, noise_levels, read_photos
 
     scene = scene or load_scene(args.scene, convention=args.convention)
-    known, chosen = None, addressed(args.context, scene)
+    known, start, chosen = None, None, addressed(args.context, scene)
     if is_path_file(args.trajectory):
         every = cameras_at(scene, config.height, config.width)
-        known = camera_path(args, every, config)
+        named = chosen is not None and ("," in chosen or chosen in scene.names)
+        start = every.c2w[context_ids(chosen, scene, config)[0] if named else 0]
+        known = camera_path(args, every, config, start=start)
         check_sees(args, every, known, config)
     photos = read_photos(scene, context_ids(chosen, scene, config, known), config)
-    path = camera_path(args, photos.cameras, config, quiet=known is not None)
+    path = camera_path(args, photos.cameras, config, quiet=known is not None, start=start)
     normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
     noise_levels(settings, config)
     return scene, photos, path

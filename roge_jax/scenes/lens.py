@@ -5,6 +5,7 @@ they were; its width and height change, each by its own factor, such that no bor
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,15 @@ def straighten(
     K: np.ndarray, lens: Lens, size: tuple[int, int], where: str = "the photo"
 ) -> Straight:
     """The camera of the straightened picture. Raises UserError where the lens has no flat picture."""
+    try:
+        return _straighten(tuple(np.asarray(K, np.float64).ravel().tolist()), lens, size)
+    except UserError as error:
+        raise UserError(f"{where}: {error}") from None
+
+
+@functools.lru_cache(maxsize=256)  # the photos of one camera are straightened alike
+def _straighten(entries: tuple[float, ...], lens: Lens, size: tuple[int, int]) -> Straight:
+    K = np.array(entries).reshape(3, 3)
     height, width = size
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     rows, columns = np.arange(height) + 0.5, np.arange(width) + 0.5
@@ -50,20 +60,19 @@ def straighten(
         x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
         points = np.stack([(x - cx) / fx, (y - cy) / fy], -1)
         rays = ideal_rays(points, lens)
-        sideways = (
-            np.abs(rays).max(-1, keepdims=True) >= FAR / 2
-        )  # COLMAP leaves such points as they are
-        rays = np.where(sideways, points, rays)
+        if lens.model == "fisheye":  # what lies beside the camera COLMAP leaves at its angle
+            radius = np.linalg.norm(points, axis=-1, keepdims=True)
+            angle = _fisheye_angle(radius, lens)
+            rays = np.where(angle < np.pi / 2, rays, points * angle / np.maximum(radius, 1e-12))
         return rays[:, axis] * (fx, fy)[axis] + (cx, cy)[axis]
 
     if lens.model == "fisheye":
-        middle = np.array([[(0.5 - cx) / fx, 0], [(width - 0.5 - cx) / fx, 0],
-                           [0, (0.5 - cy) / fy], [0, (height - 0.5 - cy) / fy]])  # fmt: skip
+        middle = np.array([[cx / fx, 0], [(width - cx) / fx, 0], [0, cy / fy], [0, (height - cy) / fy]])  # fmt: skip
         angles = np.degrees(_fisheye_angle(np.linalg.norm(middle, axis=-1), lens))
         seen = max(angles[0] + angles[1], angles[2] + angles[3])
         if not seen < TOO_WIDE:
             raise UserError(
-                f"{where}: a fisheye view of {min(seen, 360.0):.0f} degrees has no flat picture, which ends below "
+                f"a fisheye view of {min(seen, 360.0):.0f} degrees has no flat picture, which ends below "
                 "180: crop the photos, or choose a narrower lens."
             )
     scale_x = _scale(cx, width, ideal(0.5, rows, 0).max(), ideal(width - 0.5, rows, 0).min())
@@ -72,7 +81,7 @@ def straighten(
     )
     if not (scale_x > SMALLEST and scale_y > SMALLEST):
         raise UserError(
-            f"{where}: lens coefficients {lens.coefficients} leave no usable picture (its sides would change by "
+            f"lens coefficients {lens.coefficients} leave no usable picture (its sides would change by "
             f"factors of {scale_x:.3g} and {scale_y:.3g}): check them."
         )
     new_width = int(max(1.0, min(scale_x, LARGEST) * width))
@@ -147,8 +156,27 @@ def ideal_rays(points: np.ndarray, lens: Lens) -> np.ndarray:
         below = bend(middle) < radius
         low, high = np.where(below, middle, low), np.where(below, high, middle)
     rays = unit * np.where(out, reach, 0.5 * (low + high))[:, None]
-    for _ in range(30 if any(np.pad(lens.coefficients, (0, 4))[2:4]) else 0):  # the tangential part
-        rays = np.where(out[:, None], rays, rays - (distorted(rays, lens) - points))
+    if any(np.pad(lens.coefficients, (0, 4))[2:4]):
+        rays = _with_tangential(rays, points, lens, out)
+    return rays
+
+
+def _with_tangential(
+    rays: np.ndarray, points: np.ndarray, lens: Lens, out: np.ndarray
+) -> np.ndarray:
+    """Newton's steps for the tangential part, from the radial solution; steps that lead away are not taken."""
+    h = 1e-6
+    for _ in range(20):
+        off = distorted(rays, lens) - points
+        columns = [(distorted(rays + h * d, lens) - distorted(rays - h * d, lens)) / (2 * h) for d in np.eye(2)]  # fmt: skip
+        (a, c), (b, d) = columns[0].T, columns[1].T
+        det = a * d - b * c
+        det = np.where(np.abs(det) < 1e-9, np.inf, det)
+        step = np.stack([d * off[:, 0] - b * off[:, 1], a * off[:, 1] - c * off[:, 0]], -1)
+        new = rays - step / det[:, None]
+        better = np.linalg.norm(new - rays, axis=-1) < 1.0
+        better &= np.linalg.norm(distorted(new, lens) - points, axis=-1) < np.linalg.norm(off, axis=-1)  # fmt: skip
+        rays = np.where((better & ~out)[:, None], new, rays)
     return rays
 
 

@@ -23,10 +23,13 @@ from roge_jax.geometry.cameras import (
 )
 from roge_jax.geometry.interpolation import interpolate
 from roge_jax.geometry.validation import Finding
-from roge_jax.scenes import world
+from roge_jax.scenes import world, writers
 from roge_jax.scenes.assemble import Posed, pose_frame
 from roge_jax.scenes.frames import Frame, Reading
 from roge_jax.scenes.readers import read_place
+from roge_jax.scenes.writers import transforms
+
+__all__ = ["LoadedPath", "interpolate", "load_path", "read_path", "save_path", "transforms"]
 
 MOST = 1_000_000  # frames that keyframes are interpolated to: more are a slip of the pen
 KEY_FRAMES = 81  # of key frames that do not say how many frames they make
@@ -50,8 +53,18 @@ def save_path(
     *,
     convention: str = "opencv",
     fps: float | None = None,
+    layout: str = "path",
+    names: Sequence[str] | None = None,
 ) -> None:
-    """Writes cameras [n] of height x width pictures as a path file, every frame with its K."""
+    """Writes cameras [n] of height x width pictures as a path file, every frame with its K.
+
+    layout: "path" is our own; "nerfstudio", "realestate10k", "tum" (a file each), "colmap" and "colmap-binary" (`file`
+    is the folder of the model) are those of other programs, with `names` for the pictures (`writers.write`).
+    """
+    if layout != "path":
+        if convention != "opencv":
+            raise UserError(f"{file}: {layout} has axes of its own: leave 'convention' away.")
+        return writers.write(file, cameras, height, width, layout=layout, names=names, fps=fps)
     if convention not in CONVENTIONS:
         hint = did_you_mean(convention, CONVENTIONS)
         raise UserError(f"Unknown camera convention '{convention}': {hint}")
@@ -65,21 +78,6 @@ def save_path(
     content: dict[str, Any] = {"convention": convention, "width": width, "height": height}
     content |= {"fps": fps} if fps else {}
     Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1))
-
-
-def transforms(names: Sequence[str], cameras: Cameras, height: int, width: int) -> dict[str, Any]:
-    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
-    frames = []
-    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {
-            "file_path": f"frames/{name}",
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
-        }
-        frames.append(entry | {"transform_matrix": pose})
-    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
 
 
 def load_path(

@@ -114,8 +114,10 @@ def read_place(
     """What lies at `path`, a folder or a file. `photos`: it is to be a scene; else a path, of pictures of size `target`."""
     check_word(convention)
     if not path.exists():
-        what = "scene folder or file" if photos else "path file"
-        raise UserError(f"{path}: there is no such {what}, so cannot read it.")
+        what = "there is no such scene folder or file"
+        raise UserError(
+            f"{path}: {what if photos else 'cannot read the path file (no such file)'}."
+        )
     if path.is_file():
         return _read_file(path, convention=convention, photos=photos, target=target)
     found = read_folder(path, convention=convention, camera=camera, photos=photos)

@@ -103,7 +103,8 @@ def _stack(values: Any, where: str) -> np.ndarray:
 
 def _intrinsics(values: Any, count: int, where: str) -> list[np.ndarray]:
     found = np.asarray(values)
-    if found.ndim and found.shape[-1] == 4 and found.ndim <= 2 and found.shape != (4, 4):
+    square = found.shape == (4, 4) and np.allclose(found[3], [0, 0, 0, 1])
+    if found.ndim and found.shape[-1] == 4 and found.ndim <= 2 and not square:
         found = np.stack([entries.intrinsics(*row) for row in found.reshape(-1, 4).astype(float)])
     if found.ndim == 2:
         found = found[None]
