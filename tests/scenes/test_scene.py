@@ -530,3 +530,45 @@ def test_scene_of_arrays_has_sizes():
     images = [picture(0).astype(np.float32) / 255, picture(1, 10, 20).astype(np.float32) / 255]
     scene = Scene(images, CAMERAS[:2], ("a", "b"), "test")
     assert scene.sizes == [(HEIGHT, WIDTH), (10, 20)] and len(scene) == 2
+
+
+def test_check_blames_no_axes_where_the_photos_are_wrong(monkeypatch, tmp_path):
+    """Right poses and upside-down or shifted photos: the cause that fits is named, and no convention."""
+    from roge_jax import check as module
+
+    folder = files.nerfstudio(tmp_path, CAMERAS)
+    scene = load_scene(folder)
+    for best, words in (
+        ("upside down", "the photos are upside down"),
+        ("the next", "have the poses of their neighbours"),
+        ("opencv_w2c", "check intrinsics, picture order and poses"),
+    ):
+        # 1.3 pixels are no fit, though better than what is given by far.
+        far = {"opengl": 5.0, "opencv": 9.0, "opencv_w2c": 1.3, "opengl_w2c": 9.0}
+        far |= {"upside down": 4.0, "the next": 4.0, "the one before": 4.0}
+        if best in ("upside down", "the next"):
+            far[best] = 0.3
+        monkeypatch.setattr(module, "pose_agreement", lambda images, given, far=far: (far, 4))
+        _, findings = _about_agreement(scene, scene.cameras, Config(str(folder)))
+        assert len(findings) == 1 and words in str(findings[0])
+        assert "give --convention" not in str(findings[0])
+    good = {name: 9.0 for name in far} | {"opengl": 20.0, "opencv": 0.4}
+    monkeypatch.setattr(module, "pose_agreement", lambda images, given: (good, 4))
+    _, findings = _about_agreement(scene, scene.cameras, Config(str(folder)))
+    assert "give --convention opencv" in str(findings[0])
+
+
+def test_cameras_of_other_causes():
+    """Turning the pictures by half a turn and taking the next pose: what the candidates of `check` stand for."""
+    from roge_jax.check import other_causes
+
+    scene = Scene([picture(i) for i in range(4)], CAMERAS, tuple("abcd"), "mine")
+    causes = other_causes(scene, CAMERAS)
+    upside = causes["upside down"][0]
+    point = np.zeros((1, 3))
+    for view in range(4):
+        there, _, _ = project(CAMERAS.K[view], CAMERAS.c2w[view], point)
+        turned, _, _ = project(upside.K[view], upside.c2w[view], point)
+        np.testing.assert_allclose(there + turned, [[WIDTH, HEIGHT]])
+    np.testing.assert_array_equal(causes["the next"][0].c2w[0], CAMERAS.c2w[1])
+    np.testing.assert_array_equal(causes["the one before"][0].c2w[1], CAMERAS.c2w[0])
