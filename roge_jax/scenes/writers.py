@@ -5,7 +5,7 @@ Each function writes what the format's own programs read; `scenes.readers` reads
 
 import json
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +99,7 @@ def _tum(
     place.write_text("\n".join(lines) + "\n")
 
 
-def _digits(numbers: Sequence[float]) -> list[str]:
+def _digits(numbers: Iterable[float]) -> list[str]:
     return [repr(float(number)) for number in numbers]
 
 

@@ -248,7 +248,6 @@ POSES = {
     "npz extrinsics 3x4": lambda f: npz(f, extrinsics=invert(CAMERAS.c2w)[:, :3]),
     "npy": lambda f: npy(f, CAMERAS.c2w),
     "npy 3x4": lambda f: npy(f, CAMERAS.c2w[:, :3]),
-    "npy 7": lambda f: npy(f, np.hstack([CAMERAS.centres, quaternion(CAMERAS.c2w[:, :3, :3])])),
     "neoverse": lambda f: npz(f, frame_matrices=CAMERAS.c2w, frame_indices=np.arange(4)),
 }
 
@@ -277,11 +276,89 @@ def test_intrinsics_of_arrays(tmp_path):
     np.testing.assert_allclose(path.K[:, :2], 2 * square.K[:, :2])
 
 
-def test_neoverse_frames_by_number_are_joined(tmp_path):
-    file = npz(tmp_path, frame_matrices=CAMERAS.c2w, frame_indices=np.array([0, 5, 10, 15]))
+@pytest.mark.parametrize("inverse", [False, True])
+def test_rows_of_seven_numbers(tmp_path, inverse):
+    """tx ty tz qx qy qz qw: which way they go is told; SpatialVID's go the other way, with K divided by the size."""
+    poses = invert(CAMERAS.c2w) if inverse else CAMERAS.c2w
+    seven = np.hstack([poses[:, :3, 3], quaternion(poses[:, :3, :3])])
+    square, file = more.one_K(CAMERAS, centred=True), tmp_path / "trajectory.npy"
+    if inverse:
+        file = tmp_path / "poses.npy"
+        unit = square.K / [[[WIDTH], [HEIGHT], [1.0]]]
+        np.save(tmp_path / "intrinsics.npy", unit[:, [0, 1, 0, 1], [0, 1, 2, 2]])
+    np.save(file, seven)
+    words = "world to camera, as SpatialVID's" if inverse else "are read as camera to world"
+    with pytest.warns(CameraWarning, match=words):
+        path = load_path(file, context=square, **SIZE)
+    np.testing.assert_allclose(path.c2w, CAMERAS.c2w, atol=1e-9)
+    np.testing.assert_allclose(path.K, square.K, rtol=2e-3)
+    said = "opencv_w2c" if inverse else "opencv"
+    np.testing.assert_allclose(load_path(file, context=square, convention=said).c2w, path.c2w)
+
+
+@pytest.mark.parametrize("form", ["npz", "json", "json that names an npz"])
+def test_neoverse_frames_by_number_are_joined(tmp_path, form):
+    """Given at frames 0, 5, 10, 15: sixteen frames, the given ones as they are."""
+    indices = [0, 5, 10, 15]
+    file = npz(tmp_path, frame_matrices=CAMERAS.c2w, frame_indices=np.array(indices))
+    if form == "json":
+        given = {"frame_indices": indices, "frame_matrices": CAMERAS.c2w.tolist()}
+        file = write(tmp_path / "p.json", {"num_frames": 16, "trajectory": given})
+    elif form != "npz":
+        given = {"file": "/somewhere/else/a.npz"}
+        file = write(tmp_path / "p.json", {"num_frames": 16, "trajectory": given})
     path = load_path(file, context=CAMERAS, **SIZE)
     assert len(path) == 16
     np.testing.assert_allclose(path.c2w[::5], CAMERAS.c2w, atol=1e-9)
+    np.testing.assert_allclose(path.centres[1], 0.8 * path.centres[0] + 0.2 * path.centres[5])
+
+
+MOVES = {
+    "pan_right": ({"angle": 90}, [0, 0, 0], [1, 0, 0]),
+    "pan_left": ({"angle": 90}, [0, 0, 0], [-1, 0, 0]),
+    "tilt_up": ({"angle": 90}, [0, 0, 0], [0, -1, 0]),
+    "tilt_down": ({"angle": 90}, [0, 0, 0], [0, 1, 0]),
+    "move_right": ({"distance": 2}, [2, 0, 0], [0, 0, 1]),
+    "move_left": ({"distance": 2}, [-2, 0, 0], [0, 0, 1]),
+    "boom_up": ({"distance": 2}, [0, -2, 0], [0, 0, 1]),
+    "boom_down": ({"distance": 2}, [0, 2, 0], [0, 0, 1]),
+    "push_in": ({}, [0, 0, 0.1], [0, 0, 1]),
+    "pull_out": ({}, [0, 0, -0.1], [0, 0, 1]),
+    "orbit_right": ({"angle": 90, "orbit_radius": 3}, [3, 0, 3], [-1, 0, 0]),
+    "orbit_left": ({"angle": 90, "orbit_radius": 3}, [-3, 0, 3], [1, 0, 0]),
+    "static": ({}, [0, 0, 0], [0, 0, 1]),
+}
+
+
+@pytest.mark.parametrize("move", MOVES)
+def test_neoverses_named_moves(tmp_path, move):
+    """Where each move ends, in the first camera's axes (x right, y down, z ahead), from the photo that leads."""
+    options, place, looks = MOVES[move]
+    keys = [{"0": [{"static": {}}]}, {"8": [{move: options}]}]
+    file = write(tmp_path / "p.json", {"num_frames": 9, "keyframes": keys, "mode": "relative"})
+    path = load_path(file, context=CAMERAS, **SIZE)
+    assert len(path) == 9
+    local = np.linalg.inv(CAMERAS.c2w[0]) @ path.c2w
+    np.testing.assert_allclose(local[0], np.eye(4), atol=1e-9)
+    np.testing.assert_allclose(local[8, :3, 3], place, atol=1e-9)
+    np.testing.assert_allclose(local[8, :3, 2], looks, atol=1e-9)
+    np.testing.assert_allclose(local[4, :3, 3], 0.5 * np.array(place), atol=1e-9)
+
+
+def test_neoverses_mistakes_are_named(tmp_path):
+    def load(**content):
+        load_path(write(tmp_path / "p.json", {"num_frames": 5} | content), context=CAMERAS)
+
+    with pytest.raises(UserError, match="there is no move 'pan_lefft': did you mean 'pan_left'"):
+        load(keyframes=[{"0": [{"pan_lefft": {}}]}])
+    with pytest.raises(UserError, match="frame numbers of 'keyframes' must increase"):
+        load(keyframes=[{"4": [{"static": {}}]}, {"0": [{"static": {}}]}])
+    with pytest.raises(UserError, match="'mode' is 'world'"):
+        load(keyframes=[{"0": [{"static": {}}]}], mode="world")
+    with pytest.raises(UserError, match="in the coordinates of the editor"):
+        load(keyframes=[{"0": [{"static": {}}]}], mode="global")
+    with pytest.warns(CameraWarning, match="'zoom_ratio' is not used"):
+        load(keyframes=[{"0": [{"static": {}}]}], zoom_ratio=2.0)
 
 
 def test_realestate10k_without_pictures_is_a_path(tmp_path):

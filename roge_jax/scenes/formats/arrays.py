@@ -8,6 +8,7 @@ import numpy as np
 from roge_jax.errors import UserError
 from roge_jax.geometry.cameras import rotation
 from roge_jax.scenes import entries
+from roge_jax.scenes.formats import neoverse
 from roge_jax.scenes.formats.folders import load_npz
 from roge_jax.scenes.frames import NORMALISED, Frame, Reading, in_axes
 from roge_jax.scenes.pictures import Finder
@@ -21,7 +22,7 @@ def read_npz(file: Path, *, convention: str | None) -> Reading:
     """An npz of poses [n, 4, 4] (camera to world, or `w2c_poses`) with or without `intrinsics`; OpenCV axes."""
     fields = load_npz(file)
     if "frame_matrices" in fields:  # NeoVerse
-        return _neoverse(file, fields, convention)
+        return neoverse.from_matrices(fields, str(file), file, convention, None)
     name = next((n for n in (*INVERSE, *POSES) if n in fields), None)
     if name is None:
         raise UserError(
@@ -48,31 +49,19 @@ def read_npz(file: Path, *, convention: str | None) -> Reading:
     return reading
 
 
-def _neoverse(file: Path, fields: dict[str, np.ndarray], convention: str | None) -> Reading:
-    poses = _stack(fields["frame_matrices"], f"{file}: 'frame_matrices'")
-    axes = convention or "opencv"
-    reading = Reading(file, [Frame(None, None, in_axes(pose, axes)) for pose in poses], axes=axes)
-    reading.frame = "first"
-    if "frame_indices" in fields:
-        times = np.ravel(fields["frame_indices"]).astype(np.float64)
-        if len(times) != len(poses) or not (np.diff(times) > 0).all():
-            raise UserError(
-                f"{file}: 'frame_indices' must have one number a matrix, in increasing order."
-            )
-        if len(times) > 1 and (np.diff(times) != 1).any():
-            reading.keys, reading.times = True, times
-            reading.count = int(times[-1] - times[0]) + 1
-    return reading
-
-
 def read_npy(file: Path, *, convention: str | None) -> Reading:
-    """An npy of poses: [n, 4, 4], [n, 3, 4], [n, 16], [n, 12], or [n, 7] as tx ty tz qx qy qz qw; OpenCV axes."""
+    """An npy of poses: [n, 4, 4], [n, 3, 4], [n, 16], [n, 12], or [n, 7] as tx ty tz qx qy qz qw; OpenCV axes.
+
+    Camera to world, but SpatialVID's `poses.npy` (seven numbers, beside `intrinsics.npy`) is world to camera.
+    """
     try:
         values = np.load(file)
     except (OSError, ValueError, EOFError) as error:
         raise UserError(f"{file}: damaged npy file ({error}): copy it again.") from None
-    axes = convention or "opencv"
-    if values.ndim == 2 and values.shape[1] == 7:
+    seven = values.ndim == 2 and values.shape[1] == 7
+    spatial = seven and file.name == "poses.npy" and file.with_name("intrinsics.npy").is_file()
+    axes = convention or ("opencv_w2c" if spatial else "opencv")
+    if seven:
         lengths = np.linalg.norm(values[:, 3:], axis=-1)
         if not ((lengths > 0.5) & (lengths < 2)).all():
             raise UserError(f"{file}: its rows of 7 are no 'tx ty tz qx qy qz qw'.")
@@ -89,7 +78,14 @@ def read_npy(file: Path, *, convention: str | None) -> Reading:
         Frame(None, k, in_axes(pose, axes), NORMALISED if k is not None and np.abs(k).max() < 20 else None)
         for pose, k in zip(poses, Ks, strict=True)
     ]  # fmt: skip
-    return Reading(file, frames, axes=axes)
+    reading = Reading(file, frames, axes=axes)
+    if seven and convention is None:
+        way = "world to camera, as SpatialVID's" if spatial else "camera to world"
+        reading.note(
+            f"rows of seven numbers are read as {way}",
+            "--convention opencv (camera to world) or opencv_w2c says which they are",
+        )
+    return reading
 
 
 def _stack(values: Any, where: str) -> np.ndarray:

@@ -10,12 +10,13 @@ from roge_jax.errors import UserError
 from roge_jax.files.fields import number
 from roge_jax.geometry.cameras import rotation
 from roge_jax.scenes import entries
+from roge_jax.scenes.formats import neoverse
 from roge_jax.scenes.formats.nerfstudio import check_convention, rate
 from roge_jax.scenes.frames import Frame, Reading, in_axes
 
 READ = (
     "a path file of ours ('convention' and 'frames' or 'keyframes'), nerfstudio's camera path or transforms.json, "
-    "GEN3C's or Lyra's key frames, ReCamMaster's extrinsics"
+    "GEN3C's or Lyra's key frames, NeoVerse's moves, ReCamMaster's extrinsics"
 )
 FULL_HD = (1080, 1920)
 # What a file may say that does not move or shape the camera, or that is in the frames already.
@@ -37,6 +38,8 @@ def read(
         return read_recammaster(content, file)
     if isinstance(content.get("path"), list) and "frames" not in content:
         return read_keys(content, file, target)
+    if neoverse.is_neoverse(content):
+        return neoverse.read(content, file, convention=convention)
     viewer = isinstance(content.get("camera_path"), list)
     keys = content.get("keyframes")
     listed = isinstance(keys, list) and keys and isinstance(keys[0], dict) and "matrix" in keys[0]
