@@ -197,8 +197,17 @@ def _image_lines(model: Path) -> list[tuple[int, str]]:
     while lines and not lines[0][1].strip():
         lines.pop(0)
     if any(_is_image(text) for _, text in lines[1::2]):
-        return [(number, text) for number, text in lines if _is_image(text)]
+        return [(n, text) for n, text in lines if text.strip() and not _is_points(text)]
     return [(number, text) for number, text in lines[::2] if text.strip()]
+
+
+def _is_points(line: str) -> bool:
+    """Whether a line is a list of points: numbers, three a point (x y id)."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(float(word) is not None for word in words)
+    except ValueError:
+        return False
 
 
 def _is_image(line: str) -> bool:
@@ -211,8 +220,7 @@ def _is_image(line: str) -> bool:
         norm = sum(float(word) ** 2 for word in words[1:5])
     except ValueError:
         return False
-    numbers = [word.lstrip("-").replace(".", "", 1).isdecimal() for word in words[9].split()]
-    return abs(norm - 1) < 1e-2 and not (all(numbers) and len(numbers) % 3 == 0)
+    return abs(norm - 1) < 1e-2 and not _is_points(line)
 
 
 def _lines(file: Path) -> list[tuple[int, str]]:

@@ -159,7 +159,7 @@ def _ends_with(long: list[str], short: list[str]) -> bool:
 
 def masks_beside(folder: Path) -> int:
     """How many masks lie where other tools put them for the photos of `folder`."""
-    count = 0
+    count = sum("mask" in file.stem.lower() for file in folder.iterdir() if is_picture(file))
     for place in {folder.parent, folder}:
         for sub in place.iterdir() if place.is_dir() else ():
             if "mask" in sub.name.lower() and sub.is_dir() and not sub.name.startswith("."):

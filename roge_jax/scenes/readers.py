@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.files.fields import number, read_json
+from roge_jax.files.fields import number, read_json, read_text
 from roge_jax.geometry.cameras import CONVENTIONS
 from roge_jax.scenes.colmap import holds_model
 from roge_jax.scenes.formats import arrays, colmap, folders, json_paths, nerfstudio, trajectories
@@ -209,7 +209,9 @@ def _read_file(
         return readers[ending]()
     if what := _binary(file):
         raise UserError(f"{file}: {what}")
-    if ending in (".txt", ".tum", ".kitti", ".csv"):
+    if ending in (".txt", ".tum", ".kitti", ".csv") or (
+        ending != ".json" and not read_text(file, "scene file").lstrip().startswith(("{", "["))
+    ):
         return _read_text_file(file, convention)
     content = read_json(file, "scene file" if photos else "path file")
     if nerfstudio.is_lvsm(content):

@@ -547,3 +547,40 @@ def test_the_axes_that_were_read_are_named(tmp_path):
     path = read_path(tmp_path / "poses.npz", convention="opengl")
     assert path.axes == "opengl"
     np.testing.assert_allclose(path.cameras.c2w, CAMERAS.c2w, atol=1e-9)
+
+
+def test_a_torn_line_between_images_is_named(tmp_path):
+    """Lines that are neither images nor points are not passed over, with or without lines of points."""
+    folder = files.colmap(tmp_path, CAMERAS, binary=False)
+    file = folder / "sparse" / "0" / "images.txt"
+    lines = file.read_text().split("\n")
+    for kept in (lines[:9], [lines[0], *lines[1:9:2]]):
+        torn = [line.replace(" 3 0002.png", "") for line in kept]
+        file.write_text("\n".join(torn) + "\n")
+        with pytest.raises(UserError, match=r"images.txt, line \d+: expected 'id qw"):
+            load_scene(folder)
+
+
+def test_masks_among_the_photos(tmp_path):
+    """instant-ngp's dynamic_mask_NAME.png lie beside the photos: no photos without a pose, but masks."""
+    files.nerfstudio(tmp_path, CAMERAS)
+    for view in range(4):
+        save(tmp_path / "images" / f"dynamic_mask_{view:04d}.png", picture(0))
+    notes = told(tmp_path)
+    assert len(notes) == 1 and "4 masks" in notes[0]
+
+
+def test_text_of_another_kind_is_no_json(tmp_path):
+    (tmp_path / "scene.ply").write_text("ply\nformat ascii 1.0\n")
+    with pytest.raises(UserError, match="holds no poses that are known"):
+        load_scene(tmp_path / "scene.ply")
+
+
+@pytest.mark.parametrize(
+    ("content", "rate"), [({"seconds": 2}, 2.0), ({"seconds": 2, "fps": 9}, 9)]
+)
+def test_frame_rate_from_seconds(tmp_path, content, rate):
+    frames = [{"pose": pose.tolist(), "fov": 50.0} for pose in CAMERAS.c2w]
+    own = {"convention": "opencv", "width": WIDTH, "height": HEIGHT, "frames": frames}
+    (tmp_path / "p.json").write_text(json.dumps(own | content))
+    assert read_path(tmp_path / "p.json").fps == rate

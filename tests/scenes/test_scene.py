@@ -572,3 +572,16 @@ def test_cameras_of_other_causes():
         np.testing.assert_allclose(there + turned, [[WIDTH, HEIGHT]])
     np.testing.assert_array_equal(causes["the next"][0].c2w[0], CAMERAS.c2w[1])
     np.testing.assert_array_equal(causes["the one before"][0].c2w[1], CAMERAS.c2w[0])
+
+
+def test_in_front_tells_mirrored_photos_from_turned_axes():
+    """Points seen by two cameras lie in front of them; read with turned axes, in mirrored photos, behind, on the same lines."""
+    from roge_jax.scenes.matching import epipolar_distances, in_front
+
+    points = np.random.default_rng(0).normal(size=(50, 3)) * 0.3
+    (x, _, _), (y, _, _) = (project(CAMERAS.K[i], CAMERAS.c2w[i], points) for i in (0, 1))
+    assert in_front(x, y, CAMERAS[0], CAMERAS[1]) == 1.0
+    mirrored = [np.stack([2 * K[0, 2] - p[:, 0], p[:, 1]], -1) for p, K in ((x, CAMERAS.K[0]), (y, CAMERAS.K[1]))]  # fmt: skip
+    turned = Cameras(CAMERAS.K, CAMERAS.c2w @ np.diag([1.0, -1, -1, 1]))
+    assert np.median(epipolar_distances(*mirrored, turned[0], turned[1])) < 1e-6
+    assert in_front(*mirrored, turned[0], turned[1]) == 0.0

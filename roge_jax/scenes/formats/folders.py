@@ -50,10 +50,10 @@ def read_cut3r(folder: Path, cameras: tuple[list[Path], str, Path]) -> Reading:
     camera-to-world with OpenCV axes.
     """
     files, ending, photos = cameras
-    reading = Reading(folder, [])
+    reading, finder = Reading(folder, []), Finder(photos)
     for file in files:
         stem = file.stem.removesuffix(ending) + ("_rgb" if ending else "")
-        picture = with_ending(photos / f"{stem}")
+        picture = with_ending(photos / f"{stem}") or finder.find(stem)
         if picture is None:
             reading.missing.append(stem)
         fields = load_npz(file)

@@ -65,6 +65,15 @@ def _told(content: dict, reading: Reading) -> Reading:
     return reading
 
 
+def _rate(content: dict, file: Path, frames: int) -> float | None:
+    """Frames per second: as the file says, or so many frames in its `seconds`."""
+    found = rate(content, file)
+    if found is None and content.get("seconds") is not None:
+        seconds = number(content["seconds"], str(file), "seconds", low=0)
+        found = rate({"fps": frames / seconds}, file) if seconds else None
+    return found
+
+
 def _entries(content: dict, names: tuple[str, ...], field: str, file: Path) -> list[dict]:
     listed = next((content[name] for name in names if content.get(name) is not None), None)
     if not isinstance(listed, list) or not listed:
@@ -102,7 +111,9 @@ def read_own(
     listed = _entries(content, ("frames", "keyframes"), "pose", file)
     axes = content.get("convention") or convention or ""
     check_convention(axes, file)
-    reading = Reading(file, [], axes=axes, fps=rate(content, file))
+    whole = "keyframes" not in content
+    fps = _rate(content, file, len(listed)) if whole else rate(content, file)
+    reading = Reading(file, [], axes=axes, fps=fps)
     for i, entry in enumerate(listed):
         where = f"{file}, frame {i}"
         pose = in_axes(_usable(entry, "pose", where), axes)
@@ -130,7 +141,8 @@ def read_viewer(
     listed = _entries(content, names, field, file)
     axes = content.get("convention") or convention or "opengl"
     check_convention(axes, file)
-    reading = Reading(file, [], axes=axes, fps=rate(content, file), frame="nerfstudio")
+    fps = _rate(content, file, len(listed)) if whole else rate(content, file)
+    reading = Reading(file, [], axes=axes, fps=fps, frame="nerfstudio")
     defaults = {k: v for k, v in content.items() if k not in ("fps", "seconds")}
     if content.get("default_fov") is not None:
         defaults.setdefault("fov", content["default_fov"])
