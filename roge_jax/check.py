@@ -81,7 +81,7 @@ def check(config: Config) -> Report:
         finding = Finding("error", "scene", str(error).rstrip("."), "nothing else was looked at")
         return Report(config.scene, {}, [finding])
     heights, widths = zip(*scene.sizes, strict=True)
-    cameras, findings = inspect(scene.cameras, heights, widths, scene.names)
+    cameras, findings = inspect(scene.cameras, heights, widths, scene.names, scene.axes)
     findings = [*scene.notes, *findings]
     broken = any(finding.severity == "error" for finding in findings)
     numbers: dict[str, Any] = {"photos": len(scene), "sizes": _sizes(scene)}

@@ -42,7 +42,8 @@ class Scene:
 
     images: a sequence of float32 RGB [h, w, 3] in [0, 1], decoded on access when they are files;
       sizes may differ. depths: z-depth [h, w] per view in the scene's unit where it is known, NaN
-      where it is not. notes: what reading changed or assumed, as findings.
+      where it is not. notes: what reading changed, assumed or left out, as findings. axes: the convention the poses were
+      read in where the layout leaves it open.
     """
 
     images: Sequence[np.ndarray]
@@ -51,6 +52,7 @@ class Scene:
     source: str
     depths: Sequence[np.ndarray] | None = None
     notes: tuple[Finding, ...] = ()
+    axes: str = ""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -78,7 +80,7 @@ def load_scene(spec: str | Path, **options: Any) -> Scene:
             warnings.warn(str(note), CameraWarning, stacklevel=2)
     heights, widths = zip(*scene.sizes, strict=True)
     try:
-        cameras = validate(scene.cameras, heights, widths, scene.names)
+        cameras = validate(scene.cameras, heights, widths, scene.names, read_as=scene.axes)
     except UserError as error:
         raise UserError(f"{scene.source}: {error}") from None
     return dataclasses.replace(scene, cameras=cameras)
@@ -137,7 +139,8 @@ def _assemble(reading: Reading, source: str, exif: str, background: float) -> Sc
     photos = Photos([one.photo for one in posed if one.photo is not None])
     names = _names([frame.address() for frame in reading.frames], [f.file for f in reading.frames])
     told = [dataclasses.replace(note, where=source) for note in reading.notes]
-    return Scene(photos, cameras, names, source, notes=(*told, *notes.values()))
+    everything = (*told, *notes.values())
+    return Scene(photos, cameras, names, source, notes=everything, axes=reading.axes)
 
 
 def _names(addresses: list[str], files: list[Path | None]) -> tuple[str, ...]:

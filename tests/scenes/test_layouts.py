@@ -570,6 +570,28 @@ def test_masks_among_the_photos(tmp_path):
     assert len(notes) == 1 and "4 masks" in notes[0]
 
 
+def test_photos_of_colmap_in_shrunk_folders(tmp_path):
+    """An empty images/, images_10 before images_4 by alphabet, a folder of masks: the largest one that has the photos."""
+    folder = files.colmap(tmp_path, CAMERAS, binary=True)
+    for view in range(4):
+        (folder / "images" / f"{view:04d}.png").unlink()
+        for factor in (2, 4):
+            small = picture(view, HEIGHT // factor, WIDTH // factor)
+            save(folder / f"images_{2 * factor + (factor == 4) * 2}" / f"{view:04d}.png", small)
+        save(folder / "images_1x_masks" / f"{view:04d}.png", picture(9))
+    with pytest.warns(CameraWarning, match="4 masks"):
+        scene = load_scene(folder)  # images_4 (half the size) and images_10 (a quarter)
+    assert scene.sizes == [(HEIGHT // 2, WIDTH // 2)] * 4
+    np.testing.assert_allclose(scene.cameras.K[:, :2], CAMERAS.K[:, :2] / 2)
+
+
+def test_axes_of_scenes_are_named_as_they_were_read(tmp_path):
+    folder = files.nerfstudio(tmp_path, CAMERAS)
+    edit(folder, other_axes)
+    with pytest.warns(CameraWarning, match=r"may be OpenCV, not 'opengl' .* convention='opencv'"):
+        load_scene(folder)
+
+
 def test_text_of_another_kind_is_no_json(tmp_path):
     (tmp_path / "scene.ply").write_text("ply\nformat ascii 1.0\n")
     with pytest.raises(UserError, match="holds no poses that are known"):
