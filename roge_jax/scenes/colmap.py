@@ -225,7 +225,11 @@ def _is_image(line: str) -> bool:
 
 def _lines(file: Path) -> list[tuple[int, str]]:
     """(number, text) of every line that is not a comment; names may hold any character but a line end."""
-    text = read_text(file, "scene file").split("\n")
+    if file.name == "images.txt":  # names may be in any encoding
+        data = file.read_bytes() if file.is_file() else b""
+        text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape").split("\n")
+    else:
+        text = read_text(file, "scene file").split("\n")
     return [(i + 1, line.rstrip("\r")) for i, line in enumerate(text) if not line.startswith("#")]
 
 

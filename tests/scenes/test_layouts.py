@@ -303,13 +303,14 @@ def test_a_photo_of_another_split_is_not_taken(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["a  b.png", "a\u0085b.png", "a,b.png", "7", "IMG.JPG", "\u5199\u771f.png"]
+    "name",
+    ["a  b.png", "caf\udce9.png", "a\u0085b.png", "a,b.png", "7", "IMG.JPG", "\u5199\u771f.png"],
 )
 def test_unusual_names_in_colmap_text(tmp_path, name):
     """White space, line separators of Unicode, commas: the name as it is written."""
     folder = files.colmap(tmp_path, CAMERAS, binary=False)
     file = folder / "sparse" / "0" / "images.txt"
-    file.write_text(file.read_text().replace("0002.png", name), encoding="utf-8")
+    file.write_text(file.read_text().replace("0002.png", name), "utf-8", "surrogateescape")
     there = {"7": "7.png", "IMG.JPG": "img.jpg"}.get(name, name)
     (folder / "images" / "0002.png").rename(folder / "images" / there)
     scene = load_scene(folder)
