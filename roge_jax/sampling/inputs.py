@@ -232,7 +232,7 @@ def addressed(context: str | None, scene) -> str | None:
     """
     from ..scenes.scene import find_view
 
-    if context is None or context in scene.names:
+    if context is None or (context in scene.names and "," not in context):
         return context
     words, at = context.split(","), 0
     found: list[str] = []
@@ -252,7 +252,7 @@ def addressed(context: str | None, scene) -> str | None:
         else:
             found.append(words[at])
             at += 1
-    if len(found) == 1 and len(words) == 1 and found[0] != context:
+    if len(found) == 1 and found[0] != context:
         return f"{found[0]},"  # a number alone is a count
     return ",".join(found)
 

@@ -116,5 +116,6 @@ def test_names_with_commas(tmp_path):
     (folder / "images" / "0002.png").rename(folder / "images" / "a.png")
     scene = load_scene(folder)
     assert inputs.addressed("a, b.png,0003.png", scene) == "1,0003.png"
+    assert inputs.addressed("a, b.png", scene) == "1," and inputs.addressed("2,", scene) == "2,"
     assert inputs.addressed("0000.png,a.png", scene) == "0000.png,a.png"
     assert inputs.addressed("4", scene) == "4" and inputs.addressed(None, scene) is None

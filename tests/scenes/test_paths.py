@@ -481,3 +481,11 @@ def test_written_nerfstudio_files_are_scenes(tmp_path):
         tmp_path / "transforms.json", CAMERAS, HEIGHT, WIDTH, layout="nerfstudio", names=names
     )
     np.testing.assert_allclose(load_scene(tmp_path).cameras.K, CAMERAS.K)
+
+
+def test_a_path_without_photos_is_scaled_exactly(tmp_path):
+    """80x60 to 112x64 cuts 14.29 rows: square pixels stay square, no picture is there to be cut at whole ones."""
+    K = np.array([[70.0, 0, 40], [0, 70, 30], [0, 0, 1]])
+    save_path(tmp_path / "p.json", Cameras(np.tile(K, (4, 1, 1)), CAMERAS.c2w), 60, 80)
+    path = load_path(tmp_path / "p.json", height=64, width=112)
+    np.testing.assert_allclose(path.K, [[[98, 0, 56], [0, 98, 32], [0, 0, 1]]] * 4)
