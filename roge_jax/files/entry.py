@@ -27,6 +27,8 @@ from typing import Any, NoReturn
 
 from ..errors import UserError, did_you_mean
 
+_PACKAGE = __package__.partition(".")[0]
+
 CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
 LESS = "ask for less, e.g. fewer frames or photos or a smaller size (--dry-run tells what a run needs)."
 REMEDIES = {
@@ -183,7 +185,7 @@ def _expected_stops() -> tuple[type[BaseException], ...]:
         ("video.solve_info", "SamplingError"),
         ("training.loop", "TrainingStopped"),
     ):
-        loaded = sys.modules.get(f"{__package__}.{module}")
+        loaded = sys.modules.get(f"{_PACKAGE}.{module}")
         if loaded is not None:
             found.append(getattr(loaded, name))
     return tuple(found)
@@ -337,7 +339,7 @@ def environment() -> dict[str, Any]:
 
 def git_commit(folder: Path | None = None) -> str | None:
     """The commit of the package's own checkout ("-dirty" if tracked files differ), None for an installed package."""
-    folder = folder or Path(__file__).resolve().parent.parent
+    folder = folder or Path(__file__).resolve().parents[2]
     if not (folder / ".git").exists():
         return None
     try:

@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import LimitWarning
 from ..geometry.cameras import Cameras, to_host
 
-TABLE = Path(__file__).with_name("assets") / "limits.json"
+TABLE = Path(__file__).parents[1] / "assets" / "limits.json"
 SAME_PLACE, SAME_ANGLE = 0.01, 1.0  # of the baseline, degrees: photos closer than both are one
 LUMA = (0.299, 0.587, 0.114)
 GAMMA = 2.2

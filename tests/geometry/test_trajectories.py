@@ -15,16 +15,15 @@ from roge_jax.geometry.cameras import (
     opencv_to_opengl,
     relative_to,
 )
+from roge_jax.geometry.interpolation import interpolate
 from roge_jax.geometry.rays import project
 from roge_jax.geometry.trajectories import (
     PRESETS,
     focus_distance,
-    load_path,
     make_path,
-    save_path,
     world_up,
 )
-from roge_jax.scenes.paths import interpolate
+from roge_jax.scenes.paths import load_path, save_path
 
 few = settings(max_examples=15, deadline=None)
 CONTEXT = looking_at_origin(5)

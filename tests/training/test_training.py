@@ -505,7 +505,7 @@ def kill_soon_after_a_checkpoint(out, rng):
     code = f"import test_training; test_training.train_slowly({str(out)!r})"
     with subprocess.Popen(
         [sys.executable, "-c", "import conftest; " + code],
-        cwd=Path(__file__).parent,
+        cwd=Path(__file__).parents[1],
         stderr=subprocess.PIPE,
     ) as process:
         deadline = time.monotonic() + 300
