@@ -176,12 +176,7 @@ def lora(
 def one_scene(config: RoGeConfig) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """(every other frame to train on, the frames between them to score) of one long, wide path in an unknown room."""
     views = sample_sequence(
-        SCENE,
-        frames=2 * FRAMES,
-        height=config.height,
-        width=config.width,
-        sweep=SWEEP,
-        depth=False,
+        SCENE, frames=2 * FRAMES, height=config.height, width=config.width, sweep=SWEEP, depth=False
     )
     learnt, kept = ({name: x[k::2] for name, x in views.items()} for k in (0, 1))
     return learnt, kept

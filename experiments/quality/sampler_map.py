@@ -211,15 +211,8 @@ def draw(report):
         image = ax.imshow(shown, cmap="RdBu_r", vmin=-2, vmax=2, aspect="auto")
         for (i, j), value in np.ndenumerate(values):
             text = "inf" if not np.isfinite(value) else f"{value:.2g}"
-            ax.text(
-                j,
-                i,
-                text,
-                ha="center",
-                va="center",
-                fontsize=8,
-                color="w" if abs(shown[i, j]) > 1.2 else "k",
-            )
+            colour = "w" if abs(shown[i, j]) > 1.2 else "k"
+            ax.text(j, i, text, ha="center", va="center", fontsize=8, color=colour)
         ax.set(title=label)
         ax.grid(False)
         ax.set_xticks(range(len(DETAIL)), [f"{s:g}" for s in DETAIL])
@@ -247,21 +240,11 @@ def draw(report):
     ax, stability = fig.add_subplot(low[2]), report["stability"]
     for k, (name, curve) in enumerate(stability["curves"].items()):
         style = {"heun": (0, (1, 2)), "midpoint": (0, (4, 3))}.get(name, "-")
-        ax.plot(
-            stability["z"],
-            curve["growth"],
-            color=f"C{k}",
-            ls=style,
-            lw=1.6,
-            label=f"{name}: to {curve['limit']:.1f}",
-        )
+        label = f"{name}: to {curve['limit']:.1f}"
+        ax.plot(stability["z"], curve["growth"], color=f"C{k}", ls=style, lw=1.6, label=label)
     ax.axhspan(1, 10, color="#fbe3e3", zorder=0)
-    ax.set(
-        xscale="log",
-        ylim=(0, 3),
-        xlabel="stiffness of a step, h |rate|",
-        ylabel="growth of a decaying mode",
-    )
+    ax.set(xscale="log", ylim=(0, 3), xlabel="stiffness of a step, h |rate|")
+    ax.set_ylabel("growth of a decaying mode")
     ax.set_title("explicit stability limits")
 
     for axis in fig.axes[-3:]:
@@ -274,17 +257,10 @@ def draw(report):
     ax.barh(names, rejected, left=kept, color="C3", label="rejected")
     for i, name in enumerate(names):
         total = kept[i] + rejected[i]
-        ax.text(
-            total + 3,
-            i,
-            f"{total}" + (", stopped" if control[name]["failed"] else ""),
-            va="center",
-            fontsize=8,
-        )
-    ax.set(
-        xlabel="evaluations at tolerance 1e-4",
-        xlim=(0, 1.3 * max(k + r for k, r in zip(kept, rejected))),
-    )
+        text = f"{total}" + (", stopped" if control[name]["failed"] else "")
+        ax.text(total + 3, i, text, va="center", fontsize=8)
+    longest = max(k + r for k, r in zip(kept, rejected))
+    ax.set(xlabel="evaluations at tolerance 1e-4", xlim=(0, 1.3 * longest))
     ax.set_title("adaptive step control")
     ax.tick_params(axis="y", labelsize=8)
     ax.legend()

@@ -56,10 +56,7 @@ def photos(frames: int, m: int) -> tuple[list[int], list[int]]:
 
 
 def assemble(
-    params: Any,
-    sequences: Sequence[dict[str, np.ndarray]],
-    config: RoGeConfig,
-    m: int = DEFAULT_M,
+    params: Any, sequences: Sequence[dict[str, np.ndarray]], config: RoGeConfig, m: int = DEFAULT_M
 ) -> Scenes:
     """Everything of the rendered `sequences` with m photos each."""
     context, target = photos(config.frames, m)

@@ -99,15 +99,9 @@ def measure():
                     ends = np.array([1.0, 0.95, *sorted(problem.breaks, reverse=True), 1e-4, 0.0])
 
                     def call(x, tol=knob, ends=ends, problem=problem):
-                        return solve(
-                            "bosh3",
-                            problem.velocity,
-                            x,
-                            ends,
-                            breaks=problem.breaks,
-                            tolerance=tol,
-                            max_evaluations=3000,
-                        )
+                        given = {"breaks": problem.breaks, "tolerance": tol}
+                        field = problem.velocity
+                        return solve("bosh3", field, x, ends, max_evaluations=3000, **given)
 
                 else:
                     if knob <= len(problem.breaks):
@@ -170,58 +164,24 @@ def draw(records, notes):
             ax = axes[row, column]
             if note["self_error"] > ROUNDING:
                 ax.axhspan(bottom / 10, note["self_error"], color="0.85", zorder=0)
-                ax.text(
-                    0.02,
-                    0.02,
-                    f"reference's self-error, {note['self_error']:.0e}",
-                    transform=ax.transAxes,
-                    color="0.4",
-                    fontsize=8,
-                )
+                note_at = {"transform": ax.transAxes, "color": "0.4", "fontsize": 8}
+                ax.text(0.02, 0.02, f"reference's self-error, {note['self_error']:.0e}", **note_at)
             ax.axhspan(top, top * STRIP, color="#fbe3e3", zorder=0)
-            ax.text(
-                0.985,
-                0.975,
-                "failed",
-                transform=ax.transAxes,
-                ha="right",
-                va="top",
-                color="#b33",
-                fontsize=9,
-            )
+            corner = {"transform": ax.transAxes, "ha": "right", "va": "top"}
+            ax.text(0.985, 0.975, "failed", color="#b33", fontsize=9, **corner)
             for k, solver in enumerate(SOLVERS):
                 points = [r for r in mine if r["solver"] == solver]
                 fine = [r for r in points if not r["failed"]]
+                style = {"color": colours[k], "marker": markers[k]}
                 x = [work(r) for r in fine]
-                y = [r["error"]["median"] for r in fine]
-                ax.plot(x, y, color=colours[k], marker=markers[k], ms=4.5, lw=1.3, label=solver)
-                ax.fill_between(
-                    x,
-                    [r["error"]["q25"] for r in fine],
-                    [r["error"]["q75"] for r in fine],
-                    color=colours[k],
-                    alpha=0.13,
-                    lw=0,
-                )
-                if row == 1:
-                    for r in fine:
-                        ax.plot(
-                            [1e3 * r["seconds"]["q25"], 1e3 * r["seconds"]["q75"]],
-                            [r["error"]["median"]] * 2,
-                            color=colours[k],
-                            lw=1.6,
-                            alpha=0.45,
-                        )
-                bad = [r for r in points if r["failed"]]
-                height = top * 1.22 * 1.17**k
-                ax.plot(
-                    [work(r) for r in bad],
-                    [height] * len(bad),
-                    ls="",
-                    marker=markers[k],
-                    ms=4,
-                    color=colours[k],
-                )
+                low, y, high = ([r["error"][q] for r in fine] for q in ("q25", "median", "q75"))
+                ax.plot(x, y, ms=4.5, lw=1.3, label=solver, **style)
+                ax.fill_between(x, low, high, color=colours[k], alpha=0.13, lw=0)
+                for r in fine if row == 1 else ():
+                    ends = [1e3 * r["seconds"][q] for q in ("q25", "q75")]
+                    ax.plot(ends, [r["error"]["median"]] * 2, color=colours[k], lw=1.6, alpha=0.45)
+                bad = [work(r) for r in points if r["failed"]]
+                ax.plot(bad, [top * 1.22 * 1.17**k] * len(bad), ls="", ms=4, **style)
             front = pareto([(work(r), r["error"]["median"]) for r in mine if not r["failed"]])
             ax.step(*zip(*front), where="post", color="k", lw=3.5, alpha=0.22, zorder=1)
             ax.set(xscale="log", yscale="log", ylim=(bottom, top * STRIP), xlabel=label)
@@ -243,15 +203,8 @@ def triangles(ax, bottom, x0):
     y0 = bottom * 6
     for order in (1, 2, 4):
         ax.plot([x0, x1], [y0 * (x1 / x0) ** order, y0], color="0.35", lw=1)
-        ax.text(
-            x0,
-            y0 * (x1 / x0) ** order,
-            f"{order}",
-            ha="right",
-            va="center",
-            fontsize=8,
-            color="0.35",
-        )
+        grey = {"color": "0.35", "fontsize": 8, "ha": "right", "va": "center"}
+        ax.text(x0, y0 * (x1 / x0) ** order, f"{order}", **grey)
     ax.plot([x0, x1], [y0, y0], color="0.35", lw=1)
     ax.plot([x0, x0], [y0, y0 * (x1 / x0) ** 4], color="0.35", lw=1)
 

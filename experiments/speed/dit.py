@@ -191,10 +191,7 @@ def transformer_speed(cfg, slots: int, rows: int, columns: int) -> dict:
         "scan, all heads at once": ours(scores=math.inf),
         "unrolled": ours(unroll=cfg.depth),
     }
-    result = {
-        "relative_l2_between_frameworks": error,
-        "forward": compare(candidates, ROUNDS),
-    }
+    result = {"relative_l2_between_frameworks": error, "forward": compare(candidates, ROUNDS)}
     print("transformer: forward and backward, all parameters")
     variants = {
         "scan": {},

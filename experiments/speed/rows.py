@@ -334,10 +334,7 @@ def ours(row: Row, repeats: int, seconds: float, dtype: Any = None) -> dict[str,
     found["seconds"] /= work.frames
     found["quartiles"] = [x / work.frames for x in found["quartiles"]]
     notes = work.notes or {}
-    found |= {
-        "flops": work.flops / work.frames,
-        "compile_seconds": work.compile_seconds,
-    } | notes
+    found |= {"flops": work.flops / work.frames, "compile_seconds": work.compile_seconds} | notes
     found["tflops"] = found["flops"] / found["seconds"] / 1e12
     stats = jax.local_devices()[0].memory_stats() or {}
     # Of this process, which ran nothing else; what a policy that did not fit has taken would hide the one that did.
