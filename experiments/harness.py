@@ -26,9 +26,8 @@ RESULTS, DOCS = ROOT / "experiments" / "results", ROOT / "docs"
 
 def parser(description: str | None) -> argparse.ArgumentParser:
     """With the head of the program's file as its help."""
-    return argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawTextHelpFormatter
-    )
+    name, layout = " ".join(command()[:3]), argparse.RawTextHelpFormatter
+    return argparse.ArgumentParser(name, description=description, formatter_class=layout)
 
 
 def heldout(scenes: int, first: int = 0) -> range:
