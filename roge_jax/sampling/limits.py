@@ -2,7 +2,7 @@
 
 Everything that can be seen before sampling is measured here, without the network: how far targets leave the photos,
 how much wider or narrower they see, how many photos differ at all, how unlike their exposures are, how blurred and how
-noisy they are. The limits are not chosen: `experiments/robustness.py` disturbs held-out scenes, finds by interpolation
+noisy they are. The limits are not chosen: `experiments/stability/robustness.py` disturbs held-out scenes, finds by interpolation
 where the model's output has lost 1 dB, and writes `assets/limits.json` with what produced it. What a photo shows moves
 the last three as well, so their limits lie no further in than where 95 % of the undisturbed scenes are. Models without
 an entry (by the name of their configuration) get no warnings. docs/robustness.md shows the curves.
