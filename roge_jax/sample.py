@@ -38,7 +38,8 @@ def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
-    from .sampling.video import DEFAULT_CONTEXT, LONG, SLOTS
+    from .sampling.photos import DEFAULT_CONTEXT
+    from .sampling.video import LONG, SLOTS
     from .video.flow import SCHEDULES
     from .video.solver_table import SOLVERS
 

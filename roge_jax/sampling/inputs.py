@@ -1,7 +1,6 @@
 """What the options of `python -m roge_jax.sample` mean: configuration, scene, photos, path, devices and weights."""
 
 import argparse
-import dataclasses
 import sys
 import warnings
 from pathlib import Path
@@ -38,22 +37,14 @@ def model_config(args: argparse.Namespace, *, weights: bool):
         height, width = (int(side) for side in args.size.lower().split("x"))
     except ValueError:
         raise UserError(
-            f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.height}x{config.width}."
+            f"--size '{args.size}' is not HEIGHTxWIDTH: write it like {config.output_size[0]}x{config.output_size[1]}."
         ) from None
     if height > 0 and width > 0 and height * width > MOST_PIXELS:
         raise UserError(
             f"--size {args.size}: give at most {MOST_PIXELS} pixels, e.g. 4096x4096; this model was made for "
             f"{config.height}x{config.width}."
         )
-    patch = config.renderer.patch
-    ratio = config.recon_height / config.height, config.recon_width / config.width
-    return dataclasses.replace(
-        config,
-        height=height,
-        width=width,
-        recon_height=max(patch, round(height * ratio[0] / patch) * patch),
-        recon_width=max(patch, round(width * ratio[1] / patch) * patch),
-    )
+    return config.for_pictures(height, width)
 
 
 def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = False, start=None):
@@ -208,7 +199,8 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
     """
     from ..geometry.cameras import normalise
     from ..scenes.scene import cameras_at, load_scene
-    from .video import context_ids, noise_levels, read_photos
+    from .photos import context_ids, read_photos
+    from .video import noise_levels
 
     scene = scene or load_scene(args.scene, convention=args.convention)
     known, start, chosen = None, None, addressed(args.context, scene)
@@ -279,7 +271,7 @@ def stand_in(args: argparse.Namespace, config):
     one has fewer photos than --context asks for; else None."""
     from ..procedural.scenes import split_of
     from ..scenes.scene import procedural_seed
-    from .video import blank_scene
+    from .photos import blank_scene
 
     if args.scene.startswith("procedural:"):
         split_of(procedural_seed(args.scene))  # raises for a seed out of range

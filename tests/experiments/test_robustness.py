@@ -258,7 +258,7 @@ def without_network(params, views, config, slots):
     """Programs that give grey frames: nothing is compiled."""
     video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
     return programs.Programs(
-        prepare=lambda params, views: SimpleNamespace(shown=video, detail=None),
+        prepare=lambda params, views: SimpleNamespace(shown=video, detail=None, full=None),
         velocity=lambda params, prepared, noise, x, sigma: jnp.zeros_like(x),
         decode=lambda params, x0, detail: video,
     )

@@ -402,7 +402,7 @@ def test_targets_keep_their_noise_when_photos_are_dropped(photos, path, monkeypa
             drawn.append((np.asarray(noise), config.slots(0)))
             return 0 * x
 
-        shown = types.SimpleNamespace(shown=video, detail=None)
+        shown = types.SimpleNamespace(shown=video, detail=None, full=None)
         return programs.Programs(lambda *_: shown, velocity, lambda *_: video)
 
     monkeypatch.setattr(programs, "for_window", without_network)
