@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from . import model
 from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAEConfig
-from .core import sharding
+from .core import sharding, target
 from .core.attention import SCORES_BYTES
 from .core.params import flatten
 from .recon.lookup import AGREED, ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
@@ -309,9 +309,8 @@ def estimate(
     evaluations: int,
     *,
     dtype: Any = jnp.float32,
-    fused_attention: bool = False,
 ) -> Estimate:
-    """A window with m photos. `fused_attention`: scores are never stored (GPU, bfloat16).
+    """A window with m photos, on the device of `core.target`: a GPU stores no scores of attention in bfloat16.
 
     Working memory counts the tensors that live at the same time: attention scores, a block's queries,
     keys, values and hidden layer, the full-size maps of the VAE. XLA allocates within a factor of two of it on CPU,
@@ -342,7 +341,7 @@ def estimate(
     }
 
     def scores(queries: float, keys: float, heads: int) -> float:
-        return 0.0 if fused_attention else min(4.0 * queries * keys * heads, SCORES_BYTES)
+        return 0.0 if target.fused(dtype) else min(4.0 * queries * keys * heads, SCORES_BYTES)
 
     e, r, d = config.encoder, config.renderer, config.dit
     chunk = min(r.chunk, m + n)
@@ -391,14 +390,12 @@ def report(
 ) -> str:
     """What `--dry-run` prints: a video of `frames` frames from m photos.
 
-    `later`: contexts of the windows after the first; `half`: bfloat16 and fused attention; `solver`: a line on it.
+    `later`: contexts of the windows after the first; `half`: bfloat16; `solver`: a line on it.
     """
     runs = -(-frames // config.frames)
     later = later if runs > 1 else m
     dtype = jnp.bfloat16 if half else jnp.float32
-    first, next_ = (
-        estimate(config, k, evaluations, dtype=dtype, fused_attention=half) for k in (m, later)
-    )
+    first, next_ = (estimate(config, k, evaluations, dtype=dtype) for k in (m, later))
     total = first.total_flops + (runs - 1) * next_.total_flops
     peak = max(first.peak_bytes, next_.peak_bytes)
     lh, lw = config.latent_size

@@ -36,6 +36,7 @@ DTYPES = ("auto", "float32", "bfloat16")
 
 def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
+    from .core.target import TARGETS
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
     from .sampling.photos import DEFAULT_CONTEXT
@@ -104,6 +105,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--dry-run", action="store_true", help="print tokens, FLOPs and memory, and stop"
     )
+    target_help = f"the device that --dry-run counts for, here or not: {', '.join(TARGETS)}; this machine's if not given"
+    option("--target", target_help, metavar="DEVICE")
     p.add_argument("--debug", action="store_true", help="show where an error comes from")
     return p
 
@@ -172,7 +175,8 @@ def main(args: argparse.Namespace) -> None:
     import warnings
 
     from . import sampling
-    from .core import sharding
+    from .core import sharding, target
+    from .errors import UserError
     from .sampling.scene_limits import Beside
 
     settings = sampling.Settings(
@@ -185,7 +189,10 @@ def main(args: argparse.Namespace) -> None:
         scale=args.scale,
     )
     if args.dry_run:
-        return print(dry_run(args, settings))
+        with target.use(args.target):
+            return print(dry_run(args, settings))
+    if args.target:
+        raise UserError("--target is what --dry-run counts for: add it, or leave --target out.")
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
     settings = settings.of(config)
@@ -238,7 +245,7 @@ def main(args: argparse.Namespace) -> None:
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
     from . import cost
-    from .core import sharding
+    from .core import sharding, target
     from .sampling.windows import chained
     from .video import solvers
 
@@ -246,7 +253,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     settings, notes = settings.of(config), []
     dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
-        if dtype == "bfloat16":
+        if target.fused(dtype):
             sharding.check_heads(config.dit.heads, mesh)
         kept = cost.held_weights(config, mesh, dtype)
         notes.append(

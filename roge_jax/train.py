@@ -18,6 +18,8 @@ from .files.entry import number
 
 
 def parser() -> argparse.ArgumentParser:
+    from .core.target import TARGETS
+
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.train",
         description=__doc__,
@@ -89,8 +91,13 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--dry-run",
         action="store_true",
-        help="print tokens, FLOPs and bytes of a step on each device of --mesh, and stop; no weights are\n"
-        "needed; matrices of models above 1e9 parameters count as bfloat16, their attention as fused",
+        help="print tokens, FLOPs and bytes of a step on each device of --mesh, and stop; no weights are needed",
+    )
+    p.add_argument(
+        "--target",
+        metavar="DEVICE",
+        help=f"the device that --dry-run counts for, here or not: {', '.join(TARGETS)}\n"
+        "(default: this machine's; of a model above 1e9 parameters h100 if this machine has a CPU alone)",
     )
     p.add_argument(
         "--context",
@@ -128,9 +135,12 @@ def parser() -> argparse.ArgumentParser:
 
 def main(args: argparse.Namespace) -> None:
     from .core import distributed, sharding
+    from .errors import UserError
 
     if args.dry_run:
         return print(dry_run(args))
+    if args.target:
+        raise UserError("--target is what --dry-run counts for: add it, or leave --target out.")
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
@@ -168,17 +178,15 @@ def main(args: argparse.Namespace) -> None:
 
 def check(args: argparse.Namespace, cfg, chosen, mesh) -> None:
     """Raise UserError if a stage does not fit data, mesh, memory or disk; print a line where memory may be short."""
-    import jax
-
     from .core import distributed
     from .training import room, start
 
-    dtype, fused = start.kept_dtype(args.frozen_dtype), jax.default_backend() == "gpu"
+    dtype = start.kept_dtype(args.frozen_dtype)
     recipe = [(stage, stage_size(args, stage, cfg)) for stage in chosen]
     for stage, sized in recipe:
         if args.data:
             start.open_data(args.data, stage, sized)
-        room.check_layout(sized, stage, mesh, fused=fused)
+        room.check_layout(sized, stage, mesh, dtype=dtype)
     room.check_space(args.out, recipe, save_every=args.save_every)
     for line in [room.check_room(stage, sized, mesh, dtype=dtype) for stage, sized in recipe]:
         if line and distributed.is_main():
@@ -243,10 +251,9 @@ def choose(args: argparse.Namespace, cfg):
 def dry_run(args: argparse.Namespace) -> str:
     """What a step of every chosen stage costs, as text. Devices need not be there, weights are not read."""
     from . import checkpoint, config, model
-    from .core import sharding
+    from .core import target
     from .core.params import count
-    from .errors import UserError
-    from .training import estimate, room
+    from .training import estimate
 
     init = starting_point(args)
     cfg = config.preset(args.preset)
@@ -255,25 +262,31 @@ def dry_run(args: argparse.Namespace) -> str:
         check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
     large = count(model.specs(cfg)) > estimate.LARGE
-    dtype = args.frozen_dtype or ("bfloat16" if large else "float32")
+    name = args.target or ("h100" if large and target.machine() == "cpu" else None)
+    with target.use(name):
+        return "\n\n".join(planned(args, cfg, stage) for stage in chosen)
+
+
+def planned(args: argparse.Namespace, cfg, stage) -> str:
+    """What a step of one stage costs on the device of `core.target`."""
+    from .core import sharding
+    from .errors import UserError
+    from .training import estimate, room, start
+
+    dtype = start.kept_dtype(args.frozen_dtype)
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     mesh = sharding.abstract_mesh(**sizes) if sizes else None
     if args.devices:
         mesh = sharding.abstract_mesh(*sharding.mesh_sizes(args.devices, **sizes))
-    texts = []
-    for stage in chosen:
-        m = max(stage.views.contexts) if args.context is None else args.context
-        if not 1 <= m <= cfg.max_context:
-            raise UserError(
-                f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
-            )
-        sized = stage_size(args, stage, cfg)
-        room.check_layout(sized, stage, mesh, fused=dtype == "bfloat16")
-        found = estimate.estimate(
-            sized, stage, m=m, mesh=mesh, dtype=dtype, fused_attention=dtype == "bfloat16"
+    m = max(stage.views.contexts) if args.context is None else args.context
+    if not 1 <= m <= cfg.max_context:
+        raise UserError(
+            f"--context {m}: this model ({cfg.name}) takes 1 to {cfg.max_context} photos."
         )
-        texts.append(estimate.report(found, sized, stage, m=m, mesh=mesh, dtype=dtype))
-    return "\n\n".join(texts)
+    sized = stage_size(args, stage, cfg)
+    room.check_layout(sized, stage, mesh, dtype=dtype)
+    found = estimate.estimate(sized, stage, m=m, mesh=mesh, dtype=dtype)
+    return estimate.report(found, sized, stage, m=m, mesh=mesh, dtype=dtype)
 
 
 def stage_size(args: argparse.Namespace, stage, cfg):

@@ -9,6 +9,7 @@ import pytest
 
 from roge_jax import cost, fusion, model
 from roge_jax.config import preset
+from roge_jax.core import target
 from roge_jax.core.attention import SCORES_BYTES, scores_limit
 from roge_jax.core.params import abstract, count
 from roge_jax.recon import ray_scene, vggt
@@ -247,10 +248,14 @@ class TestEstimate:
         assert e.peak_bytes > sum(e.weights.values())
 
     def test_fused_attention_needs_less(self):
-        plain = cost.estimate(PAPER, 6, 1).working_bytes["velocity"]
-        fused = cost.estimate(PAPER, 6, 1, fused_attention=True).working_bytes["velocity"]
+        def working(name, dtype):
+            with target.use(name):
+                return cost.estimate(PAPER, 6, 1, dtype=dtype).working_bytes["velocity"]
+
+        plain, fused = (working(name, jnp.bfloat16) for name in ("cpu", "h100"))
         assert SCORES_BYTES < 4 * 6804**2 * 40, "queries in pieces"
         assert plain - fused == SCORES_BYTES
+        assert working("h100", jnp.float32) == working("v5p", jnp.bfloat16) == plain
 
     def test_numbers_have_the_unit_that_keeps_them_short(self):
         for value, said in (

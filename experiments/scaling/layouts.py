@@ -15,7 +15,7 @@ import jax.numpy as jnp
 
 from experiments import harness
 from roge_jax import config, cost
-from roge_jax.core import sharding
+from roge_jax.core import sharding, target
 from roge_jax.core.params import flatten
 from roge_jax.training import estimate, stages
 
@@ -42,14 +42,14 @@ def stage(cfg: config.RoGeConfig, remat: str, scenes: int, *, recon_trains: bool
 def planned(cfg, m: int, remat: str, sizes, *, recon_trains: bool) -> estimate.Estimate:
     """The step on one device of the mesh: one scene on each group of `seq` GPUs, bfloat16, fused attention."""
     data, fsdp, _ = sizes
-    return estimate.estimate(
-        cfg,
-        stage(cfg, remat, data * fsdp, recon_trains=recon_trains),
-        m=m,
-        mesh=sharding.abstract_mesh(*sizes),
-        dtype=jnp.bfloat16,
-        fused_attention=True,
-    )
+    with target.use("h100"):
+        return estimate.estimate(
+            cfg,
+            stage(cfg, remat, data * fsdp, recon_trains=recon_trains),
+            m=m,
+            mesh=sharding.abstract_mesh(*sizes),
+            dtype=jnp.bfloat16,
+        )
 
 
 def communication(

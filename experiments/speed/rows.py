@@ -277,9 +277,7 @@ def training_step(row: Row, dtype: Any) -> Job:
     failed: list[str] = []
     for remat in (row.remat,) if row.remat else ("none", "dots", "attention", "full"):
         stage = dataclasses.replace(stage, remat=remat)
-        found = estimate.estimate(
-            cfg, stage, m=m, dtype=dtype, fused_attention=dtype == jnp.bfloat16
-        )
+        found = estimate.estimate(cfg, stage, m=m, dtype=dtype)
         needs[remat] = found.bytes / 1e9
         if found.bytes > 1.1 * limit:  # the estimate may be too high: near misses are tried
             continue

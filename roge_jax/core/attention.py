@@ -11,16 +11,18 @@ import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
-from .sharding import current
+from . import target
+from .sharding import constrain, current
 
 SCORES_BYTES = 1e9  # of scores that are stored at a time, where they are stored at all
 CACHE_BYTES = 2.0**23  # ... on a lone CPU
 PIECES = "attention_pieces"  # name for `jax.checkpoint` of what the gradient of attention in pieces keeps
 _LIMIT: contextvars.ContextVar[float | None] = contextvars.ContextVar("scores", default=None)
-_AS_ON_GPU: contextvars.ContextVar[bool] = contextvars.ContextVar("as_on_gpu", default=False)
 
 
-def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) -> jax.Array:
+def attention(
+    q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32, over: str | None = None
+) -> jax.Array:
     """softmax(q k^T / sqrt(e)) v for q [.., l, k, e] and k, v [.., s, k, e]; no mask. Returns float32.
 
     `dtype` is that of the matrix products' inputs; with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
@@ -28,15 +30,18 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
     the gradient computes their scores once more. The limit is `SCORES_BYTES`; on a lone CPU it is `CACHE_BYTES` where
     a head has much of that, and every head of every sequence comes by itself: fresh memory for the scores of all
     takes longer there than the products. Heads with few scores share the work of several cores better together.
+
+    `over`: the logical axis that the caller splits over the mesh beside scenes, "attention_heads" or "views" (the first
+    of q's leading axes). The fused kernel runs on no device unless q, k and v are split alike.
     """
     scale = q.shape[-1] ** -0.5
-    if dtype == jnp.bfloat16 and (_AS_ON_GPU.get() or jax.default_backend() == "gpu"):
+    if target.fused(dtype):
         lead = q.shape[:-3]
         q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
-        y = _fused(q, k, v, scale)
+        y = _fused(q, k, v, scale, over)
         return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
     q, k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (q * scale, k, v))
-    lone_cpu = jax.default_backend() == "cpu" and current() is None
+    lone_cpu = target.platform() == "cpu" and current() is None
     large = lone_cpu and 4.0 * q.shape[-2] * k.shape[-2] > CACHE_BYTES / 8
     limit = _LIMIT.get() or (CACHE_BYTES if large else SCORES_BYTES)
     if _scores_bytes(q, k) <= limit:
@@ -51,22 +56,27 @@ def attention(q: jax.Array, k: jax.Array, v: jax.Array, *, dtype=jnp.float32) ->
     return checkpoint_name(jnp.swapaxes(y, -3, -2), "attention")
 
 
-def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float) -> jax.Array:
+def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float, over: str | None) -> jax.Array:
     """The cuDNN kernel on q [b, l, k, e] and k, v [b, s, k, e].
 
     JAX refuses odd lengths as soon as a gradient is asked for: such a length is padded by one that the kernel is told
     to leave out.
     """
     lengths, batch = (q.shape[1], k.shape[1]), q.shape[:1]
-    # Always x, with the batch axes that `jax.vmap` gave q alone: JAX 0.10 knows no other batches.
+    # Always x, with the batch axes that `jax.vmap` gave q alone: JAX 0.10 knows no other batches, and XLA gives them no
+    # place on the mesh.
     k, v = (jnp.where(True, x, q[:, :1]) for x in (k, v))
+    views = "views" if over == "views" and len(q) > 1 else None
+    place = (views, None, over if over == "attention_heads" else None, None)
+    q, k, v = (constrain(x, place) for x in (q, k, v))
     told: dict[str, Any] = {}
     if any(n % 2 for n in lengths):
         q, k, v = (jnp.pad(x, ((0, 0), (0, x.shape[1] % 2), (0, 0), (0, 0))) for x in (q, k, v))
         own = q[:, 0, 0, 0].astype(jnp.int32)
-        queries, keys = (jnp.where(True, jnp.full(batch, n, jnp.int32), own) for n in lengths)
+        both = (jnp.where(True, jnp.full(batch, n, jnp.int32), own) for n in lengths)
+        queries, keys = (constrain(x, (views,)) for x in both)
         told = {"query_seq_lengths": queries, "key_value_seq_lengths": keys}
-    if _AS_ON_GPU.get():
+    if target.only_planned():
         y = _kernel(q, k, v)
     else:
         y = jax.nn.dot_product_attention(q, k, v, scale=scale, implementation="cudnn", **told)
@@ -163,16 +173,6 @@ def scores_limit(limit: float | None) -> Iterator[None]:
         yield
     finally:
         _LIMIT.reset(token)
-
-
-@contextlib.contextmanager
-def as_on_gpu() -> Iterator[None]:
-    """Attention in bfloat16 is traced as a GPU has it, on any machine. What is traced inside cannot be run."""
-    token = _AS_ON_GPU.set(True)
-    try:
-        yield
-    finally:
-        _AS_ON_GPU.reset(token)
 
 
 def is_attention(primitive, *_, **params) -> bool:

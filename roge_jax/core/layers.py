@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from . import target
 from .params import Spec, Tree, fan_in, ones, zeros
 
 
@@ -123,7 +124,7 @@ def conv2d(p: Tree, x: jax.Array, *, stride: int = 1) -> jax.Array:
     Odd kernels; reverse-mode gradients only.
     """
     kernel = p["kernel"].astype(jnp.float32)
-    plain = stride > 1 or jax.default_backend() != "cpu"
+    plain = stride > 1 or target.platform() != "cpu"
     y = convolve(x, kernel, stride=stride) if plain else _cpu_conv2d(x, kernel)
     return y + lift(p["bias"].astype(jnp.float32), y.ndim)
 

@@ -23,6 +23,7 @@ import numpy as np
 from jax.sharding import AbstractMesh, AxisType, Mesh, NamedSharding, PartitionSpec
 
 from ..errors import UserError, did_you_mean
+from . import target
 from .params import Tree, flatten, unflatten
 
 MESH_AXES = ("data", "fsdp", "seq")
@@ -349,7 +350,7 @@ def by_heads(
         return q, k, v
     q, k, v = (x.astype(dtype) for x in (q, k, v))
     if q.shape[-2] % ways("seq"):
-        if jax.default_backend() == "gpu":
+        if target.platform() == "gpu":
             check_heads(q.shape[-2], current())
         whole = (None, None, None)
         return constrain(q, ("tokens", None, None)), constrain(k, whole), constrain(v, whole)
@@ -378,7 +379,7 @@ def over_scenes(f: Callable, params: Tree, *batch):
             return jax.lax.map(lambda scene: f(params, *scene), batch)
 
     mesh, scenes = current(), jax.tree.leaves(batch)[0].shape[0]
-    if jax.default_backend() == "cpu":
+    if target.platform() == "cpu":
         if mesh is None:
             return one_by_one(params, batch)
         if isinstance(mesh, Mesh) and mesh.size == mesh.shape["data"] and scenes % mesh.size == 0:

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..core import target
 from ..core.layers import (
     conv2d,
     conv2d_specs,
@@ -187,7 +188,7 @@ def look_up(
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.
-    alone = jax.default_backend() == "cpu" and ways("seq") == 1
+    alone = target.platform() == "cpu" and ways("seq") == 1
     looked, blend = jax.lax.map(lambda view: one(*view), views) if alone else jax.vmap(one)(*views)
     if full is None:
         return looked

@@ -65,7 +65,7 @@ def attend(
     if context.shape[0] == 1 and x.shape[0] > 1 and ways("seq") == 1:
         y = attention(q.reshape(1, -1, *q.shape[2:]), k, v, dtype=dtype).reshape(q.shape)
     else:
-        y = attention(q, k, v, dtype=dtype)
+        y = attention(q, k, v, dtype=dtype, over="views")
     y = to_output(rq, y) if rq is not None else y
     return linear(p["proj"], merge_heads(y))
 

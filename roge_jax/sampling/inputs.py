@@ -145,11 +145,11 @@ def _check_length(frames: int, where: str) -> None:
 
 def large_dtype(args: argparse.Namespace, parameters: float) -> str:
     """The dtype of large matrices that --dtype means for a model of so many parameters."""
-    import jax
+    from ..core import target
 
     if args.dtype != "auto":
         return args.dtype
-    return "bfloat16" if parameters > LARGE and jax.default_backend() != "cpu" else "float32"
+    return "bfloat16" if parameters > LARGE and target.platform() != "cpu" else "float32"
 
 
 def sampling_mesh(args: argparse.Namespace):
@@ -174,15 +174,13 @@ def sampling_mesh(args: argparse.Namespace):
 
 def load_weights(args: argparse.Namespace, mesh=None):
     """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
-    import jax
-
     from .. import checkpoint, cost, model
-    from ..core import sharding
+    from ..core import sharding, target
     from ..core.params import count
 
     config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
     specs = model.specs(config)
-    if jax.default_backend() == "gpu":
+    if target.platform() == "gpu":
         sharding.check_heads(config.dit.heads, mesh)
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(

@@ -5,7 +5,6 @@ FLOPs; memory of activations comes from the order and fusion rules described the
 XLA's own analysis.
 """
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -18,8 +17,7 @@ import jax.numpy as jnp
 
 from .. import cost, model
 from ..config import RoGeConfig
-from ..core import program, sharding
-from ..core.attention import as_on_gpu
+from ..core import program, sharding, target
 from ..core.params import Tree, abstract, count, flatten, unflatten
 from ..recon.vggt import encoder_grid
 from . import encoded
@@ -127,12 +125,12 @@ def estimate(
     m: int | None = None,
     mesh: sharding.AnyMesh | None = None,
     dtype: Any = jnp.float32,
-    fused_attention: bool = False,
 ) -> Estimate:
     """What one device of `mesh` (None: a single one) does and holds in a step with m photos (None: the most there are).
 
-    `dtype`: of frozen matrices. `fused_attention`: where they are bfloat16, attention is the fused kernel of GPUs: one
-    operation that stores no scores, and keeps its inputs, its result and the softmax's sums for its gradient.
+    `dtype`: of frozen matrices. The device is that of `core.target`. On a GPU, where they are bfloat16, attention is the
+    fused kernel: one operation that stores no scores, and keeps its inputs, its result and the softmax's sums for its
+    gradient.
     Raises UserError if the mesh does not divide the batch or a leaf.
     """
     m = max(stage.views.contexts) if m is None else m
@@ -143,11 +141,10 @@ def estimate(
     if mesh is not None:
         scenes = sharding.batch_sharding(mesh, stage.batch).shard_shape((stage.batch,))[0]
     # Traced with this device's share of the scenes, but all of their tokens.
-    whole = sharding.abstract_mesh() if mesh is not None or fused_attention else None
+    lone_cpu = mesh is None and target.platform() == "cpu"
+    whole = None if lone_cpu else sharding.abstract_mesh()
     part_of = dataclasses.replace(stage, batch=scenes)
-    traced, arguments = _traced(
-        config, part_of, m, scenes, jnp.dtype(dtype), fused_attention, whole
-    )
+    traced, arguments = _traced(config, part_of, m, scenes, jnp.dtype(dtype), target.name(), whole)
 
     tokens = sequence_lengths(working, m)
     split = split_axes(working, tokens, scenes)
@@ -226,11 +223,10 @@ def _held_all(config, stage, mesh, dtype) -> dict[str, float]:
 
 
 @functools.lru_cache(maxsize=4)
-def _traced(
-    config, stage, m, scenes, dtype, fused_attention, mesh
-) -> tuple[program.Program, tuple]:
+def _traced(config, stage, m, scenes, dtype, name, mesh) -> tuple[program.Program, tuple]:
+    """`name`: of the target that is set, for the cache."""
     step, arguments = abstract_step(config, stage, m, scenes=scenes, dtype=dtype)
-    with sharding.use(mesh), as_on_gpu() if fused_attention else contextlib.nullcontext():
+    with sharding.use(mesh):
         return program.trace(step, *arguments), arguments
 
 
@@ -317,14 +313,15 @@ def report(
     """What `train --dry-run` prints."""
     working = stage_config(config, stage)
     layout = "1 device" if mesh is None else ", ".join(f"{k}={v}" for k, v in mesh.shape.items())
-    counts = found.parameters
+    counts, device = found.parameters, target.current()
+    kind = f" of {device.title}" if target.name() in target.TARGETS else ""
     lines = [
         f"stage     {stage.name} of {config.name}: {counts['trained'] / 1e6:,.1f} M parameters train, "
         f"{counts['frozen'] / 1e6:,.1f} M are frozen ({dtype})",
         f"step      {stage.batch} scenes of {m} photos and {stage.views.targets} targets at "
         f"{working.height}x{working.width} (reconstruction at {working.recon_height}x{working.recon_width})"
         + (f", {stage.draws} noise levels each" if stage.draws > 1 else ""),
-        f"devices   {layout}: {found.scenes} scenes each; the transformer recomputes: {stage.remat}",
+        f"devices   {layout}{kind}: {found.scenes} scenes each; the transformer recomputes: {stage.remat}",
         "tokens    " + ", ".join(f"{n:,} {name}" for name, n in found.tokens.items()),
         "",
         f"{'FLOPs of one device, one step':30s}" + "".join(f"{name:>14s}" for name in PASSES),
@@ -334,7 +331,8 @@ def report(
         lines.append(f"{name:30s}" + "".join(f"{cell:>14s}" for cell in cells))
     lines += [f"{'all':30s}{cost.scaled(found.flops, 'FLOP'):>14s}", "", "bytes of one device"]
     lines += [f"{name:30s}{cost.scaled(n, 'B'):>14s}" for name, n in found.memory.items()]
-    lines.append(f"{'all':30s}{cost.scaled(found.bytes, 'B'):>14s}")
+    has = f", of {cost.scaled(device.memory, 'B')} that it has" if device.memory else ""
+    lines.append(f"{'all':30s}{cost.scaled(found.bytes, 'B'):>14s}{has}")
     lines.append(
         f"activations take the most in: {found.fullest}; XLA's scratch space is not counted, allow 10 %"
     )

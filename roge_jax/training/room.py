@@ -12,7 +12,7 @@ import jax
 
 from .. import model
 from ..config import RoGeConfig
-from ..core import sharding
+from ..core import sharding, target
 from ..core.memory import DEVICE, HOST, memory_available, own_memory, refuse
 from ..core.params import count
 from ..files.folders import check_disk
@@ -26,15 +26,15 @@ _LASTING, _SMALLER = "weights, optimiser and gradients", "or train a smaller mod
 
 
 def check_layout(
-    config: RoGeConfig, stage: Stage, mesh: sharding.AnyMesh | None, *, fused: bool
+    config: RoGeConfig, stage: Stage, mesh: sharding.AnyMesh | None, *, dtype: str
 ) -> None:
-    """Raise UserError unless the mesh divides batch, leaves and, for the `fused` attention of GPUs, heads."""
+    """Raise UserError unless the mesh divides batch, leaves and, for the fused attention of GPUs, heads."""
     if mesh is None:
         return
     loop.check_batch(stage.batch, mesh)
     for specs in stage_specs(config, stage):
         sharding.shardings(specs, mesh)
-    if fused and stage.objective in ("prior", "joint", "encoded"):
+    if target.fused(dtype) and stage.objective in ("prior", "joint", "encoded"):
         sharding.check_heads(config.dit.heads, mesh)
 
 
@@ -65,8 +65,7 @@ def check_room(
         refuse(name, needed, HOST, room, _LASTING, f"close other programs, {_SMALLER}")
     if room is None or needed < SMALL * room:
         return ""
-    fused = own and dtype != "float32"
-    found = estimate.estimate(config, stage, mesh=mesh, dtype=dtype, fused_attention=fused)
+    found = estimate.estimate(config, stage, mesh=mesh, dtype=dtype)
     taken = found.bytes if own else needed + count_here * (found.bytes - sum(lasting.values()))
     if taken <= room:
         return ""

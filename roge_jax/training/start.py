@@ -12,7 +12,7 @@ import jax
 from .. import checkpoint
 from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
-from ..core import distributed
+from ..core import distributed, target
 from ..core.params import Tree, loaded
 from ..cost import kept_as
 from ..data.source import open_source
@@ -153,7 +153,7 @@ def find_devices(count: int | None) -> list[jax.Device]:
 
 def kept_dtype(given: str | None) -> str:
     """What frozen matrices are kept in: --frozen-dtype, or what suits the devices."""
-    return given or ("float32" if jax.default_backend() == "cpu" else "bfloat16")
+    return given or ("float32" if target.platform() == "cpu" else "bfloat16")
 
 
 def provenance(start: str) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def on_host() -> contextlib.AbstractContextManager:
         cpu = jax.local_devices(backend="cpu")[0]
     except RuntimeError:  # JAX_PLATFORMS without cpu
         return contextlib.nullcontext()
-    return contextlib.nullcontext() if jax.default_backend() == "cpu" else jax.default_device(cpu)
+    return contextlib.nullcontext() if target.machine() == "cpu" else jax.default_device(cpu)
 
 
 def place_frozen(frozen: Tree, dtype: str, shardings: Tree | None = None) -> Tree:

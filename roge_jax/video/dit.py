@@ -210,7 +210,7 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
     v = split_heads(linear(p["v"], x), heads)
     dtype = p["q"]["kernel"].dtype
     q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v, dtype)
-    y = merge_heads(attention(q, k, v, dtype=dtype))
+    y = merge_heads(attention(q, k, v, dtype=dtype, over="attention_heads"))
     return linear(p["o"], constrain(y, ("tokens", None)))
 
 
@@ -218,9 +218,13 @@ def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
     dtype = p["q"]["kernel"].dtype
     q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
-    y = attention(*by_heads(q, kv["k"], kv["v"], dtype), dtype=dtype)
+
+    def read(k, v):
+        return attention(*by_heads(q, k, v, dtype), dtype=dtype, over="attention_heads")
+
+    y = read(kv["k"], kv["v"])
     if "k_img" in kv:
-        y = y + attention(*by_heads(q, kv["k_img"], kv["v_img"], dtype), dtype=dtype)
+        y = y + read(kv["k_img"], kv["v_img"])
     return linear(p["o"], constrain(merge_heads(y), ("tokens", None)))
 
 

@@ -171,7 +171,7 @@ class TestFlags:
                 item = 4 if cost.keeps_float32(path) else 2
                 held += math.prod(spec.shape) * item / (ways if "embed" in spec.axes else 1)
             assert note("--mesh", words) == pytest.approx(held / 1e6, rel=0.01)
-        words = ["--dry-run", "--checkpoint", "paper", "--dtype", "bfloat16", "--mesh", "seq=3"]
+        words = ["--dry-run", "--checkpoint", "paper", "--target", "h100", "--mesh", "seq=3"]
         assert entry.execute(sample.main, sample.parser(), words) == 2
         assert "seq=3 does not divide 40 attention heads" in capsys.readouterr().err
 

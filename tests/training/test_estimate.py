@@ -10,8 +10,8 @@ from test_sharding import small
 from experiments.scaling import memory_check
 from experiments.speed import train_profile
 from roge_jax import checkpoint, config, model, train
-from roge_jax.core import params, program, sharding
-from roge_jax.core.attention import as_on_gpu, attention, is_attention
+from roge_jax.core import params, program, sharding, target
+from roge_jax.core.attention import attention, is_attention
 from roge_jax.core.layers import convolve
 from roge_jax.core.params import flatten
 from roge_jax.errors import UserError
@@ -91,10 +91,10 @@ class TestProgram:
 
             return jax.value_and_grad(lambda x: jax.checkpoint(block, policy=policy)(x).sum())(x)
 
-        with as_on_gpu():
+        with target.use("h100"):
             found = program.trace(gradient, x, rows)
-        monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-        want = program.trace(gradient, x, rows)
+        with target.use("h100", compiled=True):
+            want = program.trace(gradient, x, rows)
         assert program.flops(found) == program.flops(want)
         assert sum(program.flops(found).values()) > 0
         # The lengths that the kernel is told are a few integers.
@@ -137,7 +137,8 @@ def test_a_whole_step_takes_what_xla_says(name):
 
 def test_the_papers_step_fits_80_gb_with_the_default_recomputation():
     cfg = config.preset("paper")
-    found = estimate.estimate(cfg, lora(cfg), m=6, dtype=jnp.bfloat16, fused_attention=True)
+    with target.use("h100"):
+        found = estimate.estimate(cfg, lora(cfg), m=6, dtype=jnp.bfloat16)
     assert 35e9 < found.memory["frozen weights"] < 37e9
     assert found.bytes < 80e9 / 1.1, found.memory
     # LoRA on both halves: 2 passes of linears and 3.5 of attention, and what is computed again.
@@ -152,14 +153,16 @@ def test_no_scores_of_the_papers_attention_are_planned_for():
     """With them a block of the transformer alone would hold 40 heads x 6804^2 x 4 bytes."""
     cfg = config.preset("paper")
     stage, tokens = lora(cfg), 6804
-    found = [
-        estimate.estimate(cfg, stage, m=6, dtype=jnp.bfloat16, fused_attention=True, mesh=mesh)
-        for mesh in (None, sharding.abstract_mesh())
-    ]
+    with target.use("h100"):
+        found = [
+            estimate.estimate(cfg, stage, m=6, dtype=jnp.bfloat16, mesh=mesh)
+            for mesh in (None, sharding.abstract_mesh())
+        ]
     assert found[0].tokens["transformer tokens"] == tokens
     assert found[0].memory == found[1].memory, "one GPU, whether a mesh says so or not"
     stored = dataclasses.replace(stage, remat="attention")
-    kept = estimate.estimate(cfg, stored, m=6, dtype=jnp.bfloat16, fused_attention=True)
+    with target.use("h100"):
+        kept = estimate.estimate(cfg, stored, m=6, dtype=jnp.bfloat16)
     more, d = kept.bytes - found[0].bytes, cfg.dit
     # Of every block the results of two attentions in bfloat16 and their sums, which the kernel's gradient reads.
     least = d.depth * 2 * tokens * (2 * d.width + 4 * d.heads)

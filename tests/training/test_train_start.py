@@ -13,7 +13,7 @@ from train_runs import run, write_pool
 from roge_jax import checkpoint, config, convert, export, model, train
 from roge_jax.checkpoint import load_provenance
 from roge_jax.config import to_dict
-from roge_jax.core import memory, params, sharding
+from roge_jax.core import memory, params, sharding, target
 from roge_jax.errors import UserError
 from roge_jax.files import entry, folders
 from roge_jax.files.entry import parse
@@ -135,11 +135,13 @@ def test_a_gpu_refuses_heads_in_every_stage_that_runs_the_transformer(objective)
     """12 heads on five devices; stages of the other networks have no tokens to split by heads."""
     cfg, mesh = config.preset("wan1.3b"), sharding.abstract_mesh(seq=5)
     stage = dataclasses.replace(lora(cfg), objective=objective)
-    room.check_layout(cfg, stage, mesh, fused=False)
+    for name, dtype in (("h100", "float32"), ("v5p", "bfloat16"), ("cpu", "bfloat16")):
+        with target.use(name):
+            room.check_layout(cfg, stage, mesh, dtype=dtype)
     transformer = objective in ("prior", "joint", "encoded")
     refused = pytest.raises(UserError, match="seq=5 does not divide 12 attention heads")
-    with refused if transformer else contextlib.nullcontext():
-        room.check_layout(cfg, stage, mesh, fused=True)
+    with refused if transformer else contextlib.nullcontext(), target.use("h100"):
+        room.check_layout(cfg, stage, mesh, dtype="bfloat16")
 
 
 class TestRoom:
