@@ -8,18 +8,22 @@ RUN := $(VENV)/bin/python
 BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
+# The compiler of GPUs has an environment of its own: beside it JAX would look for a GPU.
+AOT_VENV := .venv-aot
+AOT := $(AOT_VENV)/.aot
 CODE := roge_jax tests experiments
 # Programs of the experiments; stored sampling grids come first, because the charts use them. Left out: what `figures`
-# only draws, and comparisons with PyTorch (`make compare`).
+# only draws, comparisons with PyTorch (`make compare`), and what needs the compiler of GPUs.
 EXPERIMENTS := $(subst /,.,$(basename $(shell grep -l '^if __name__' experiments/*/*.py)))
 DRAWN := experiments.quality.training_curves
 COMPARISONS := experiments.speed.dit experiments.speed.vae experiments.speed.real_size
+COMPILED := experiments.scaling.compiled
 FIRST := experiments.quality.optimise_schedules
-FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS),$(EXPERIMENTS)))
+FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED),$(EXPERIMENTS)))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help
-.PHONY: help sample train evaluate smoke test test-slow test-parity check lint format figures compare notebook clean
+.PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators check lint format figures compare notebook clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -45,6 +49,9 @@ test-slow: $(DEV)  ## tests that take minutes or gigabytes
 
 test-parity: $(PARITY)  ## tests against PyTorch implementations (installs torch and diffusers)
 	$(RUN) -m pytest -q -m parity $(ARGS)
+
+test-accelerators: $(AOT)  ## programs compiled for GPUs that need not be there (installs their compiler, 0.6 GB)
+	$(AOT_VENV)/bin/python -m pytest -q tests/core/test_aot.py $(ARGS)
 
 check: lint test  ## what CI runs
 
@@ -86,6 +93,12 @@ $(BASE): pyproject.toml | $(VENV)/bin/python
 $(DEV): pyproject.toml | $(VENV)/bin/python
 	$(RUN) -m pip install --quiet --editable '.[dev]'
 	@touch $@ $(BASE)
+
+$(AOT): pyproject.toml
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found: make PYTHON=/path/to/python3.11"; exit 1; }
+	@test -x $(AOT_VENV)/bin/python || $(PYTHON) -m venv $(AOT_VENV)
+	$(AOT_VENV)/bin/python -m pip install --quiet --editable '.[aot]' pytest pytest-xdist hypothesis beartype
+	@touch $@
 
 $(PARITY): pyproject.toml | $(VENV)/bin/python
 	$(RUN) -m pip install --quiet --editable '.[dev,parity]'

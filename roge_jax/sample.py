@@ -107,6 +107,11 @@ def parser() -> argparse.ArgumentParser:
     )
     target_help = f"the device that --dry-run counts for, here or not: {', '.join(TARGETS)}; this machine's if not given"
     option("--target", target_help, metavar="DEVICE")
+    compile_help = (
+        "with --dry-run: also compile the first window for the GPU of --target, here or not, and print what its compiler "
+        "says (extra 'aot'; minutes)"
+    )
+    p.add_argument("--compile", action="store_true", help=compile_help)
     p.add_argument("--debug", action="store_true", help="show where an error comes from")
     return p
 
@@ -191,8 +196,8 @@ def main(args: argparse.Namespace) -> None:
     if args.dry_run:
         with target.use(args.target):
             return print(dry_run(args, settings))
-    if args.target:
-        raise UserError("--target is what --dry-run counts for: add it, or leave --target out.")
+    if args.target or args.compile:
+        raise UserError("--target and --compile belong to --dry-run: add it, or leave them out.")
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
     settings = settings.of(config)
@@ -245,10 +250,13 @@ def main(args: argparse.Namespace) -> None:
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
     from . import cost
-    from .core import sharding, target
+    from .core import aot, sharding, target
     from .sampling.windows import chained
     from .video import solvers
 
+    if args.compile:
+        aot.by_the_cpu()
+        aot.check(target.name())
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
     settings, notes = settings.of(config), []
     dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
@@ -288,6 +296,13 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         half=dtype == "bfloat16",
         solver=f"{settings.solver}, {settings.steps} steps: {count} evaluations a window{guess}",
     )
+    if args.compile:
+        from .sampling.compiled import compiled_window
+
+        data, fsdp, seq = (1, 1, 1) if mesh is None else mesh.shape.values()
+        sizes = (data, fsdp, seq)
+        said = compiled_window(config, m, name=target.name(), sizes=sizes, dtype=dtype)
+        notes.append(aot.report(said, target.name()))
     return "\n".join([text, *notes])
 
 

@@ -100,6 +100,12 @@ def parser() -> argparse.ArgumentParser:
         "(default: this machine's; of a model above 1e9 parameters h100 if this machine has a CPU alone)",
     )
     p.add_argument(
+        "--compile",
+        action="store_true",
+        help="with --dry-run: also compile the step for the GPU of --target, here or not, and print what its compiler\n"
+        "says (extra 'aot'; minutes)",
+    )
+    p.add_argument(
         "--context",
         type=number(1),
         help="photos per scene that --dry-run counts (default: the most)",
@@ -139,8 +145,8 @@ def main(args: argparse.Namespace) -> None:
 
     if args.dry_run:
         return print(dry_run(args))
-    if args.target:
-        raise UserError("--target is what --dry-run counts for: add it, or leave --target out.")
+    if args.target or args.compile:
+        raise UserError("--target and --compile belong to --dry-run: add it, or leave them out.")
     sizes = {} if args.mesh is None else sharding.parse_mesh(args.mesh)
     distributed.request_devices(args.devices or math.prod(sizes.values()))
     import jax
@@ -251,7 +257,7 @@ def choose(args: argparse.Namespace, cfg):
 def dry_run(args: argparse.Namespace) -> str:
     """What a step of every chosen stage costs, as text. Devices need not be there, weights are not read."""
     from . import checkpoint, config, model
-    from .core import target
+    from .core import aot, target
     from .core.params import count
     from .training import estimate
 
@@ -262,8 +268,11 @@ def dry_run(args: argparse.Namespace) -> str:
         check_preset(preset, cfg, init)
     cfg, chosen = choose(args, cfg)
     large = count(model.specs(cfg)) > estimate.LARGE
-    name = args.target or ("h100" if large and target.machine() == "cpu" else None)
-    with target.use(name):
+    if args.compile:
+        aot.by_the_cpu()
+    with target.use(args.target or ("h100" if large and target.machine() == "cpu" else None)):
+        if args.compile:
+            aot.check(target.name())
         return "\n\n".join(planned(args, cfg, stage) for stage in chosen)
 
 
@@ -286,7 +295,16 @@ def planned(args: argparse.Namespace, cfg, stage) -> str:
     sized = stage_size(args, stage, cfg)
     room.check_layout(sized, stage, mesh, dtype=dtype)
     found = estimate.estimate(sized, stage, m=m, mesh=mesh, dtype=dtype)
-    return estimate.report(found, sized, stage, m=m, mesh=mesh, dtype=dtype)
+    text = estimate.report(found, sized, stage, m=m, mesh=mesh, dtype=dtype)
+    if not args.compile:
+        return text
+    from .core import aot, target
+    from .training.compiled import compiled_step
+
+    name = target.name()
+    data, fsdp, seq = (1, 1, 1) if mesh is None else mesh.shape.values()
+    said = compiled_step(sized, stage, m=m, name=name, sizes=(data, fsdp, seq), dtype=dtype)
+    return f"{text}\n\n{aot.report({'step': said}, name)}"
 
 
 def stage_size(args: argparse.Namespace, stage, cfg):

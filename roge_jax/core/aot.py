@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import importlib.util
 import math
+import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -104,6 +105,11 @@ class Compiled:
     text: str  # the optimised module
     options: dict[str, Any]  # beside the defaults
 
+    @property
+    def bytes(self) -> float:
+        """All that one device holds."""
+        return self.arguments + self.temporary + self.output - self.alias
+
     @functools.cached_property
     def module(self) -> hlo.Summary:
         """Products, kernels, collectives and results of the module."""
@@ -119,6 +125,18 @@ def missing(name: str) -> str:
     return ""
 
 
+def by_the_cpu() -> None:
+    """Call it before anything asks JAX for devices: the CPU compiles, whatever else is here."""
+    if not os.environ.get("JAX_PLATFORMS"):
+        jax.config.update("jax_platforms", "cpu")
+
+
+def check(name: str) -> None:
+    """Raise UserError where `missing` says why nothing can be compiled for `name`."""
+    if why := missing(name):
+        raise UserError(f"--compile: {why}; or leave --compile out.")
+
+
 def _found(module: str) -> bool:
     try:
         return importlib.util.find_spec(module) is not None
@@ -130,10 +148,9 @@ def _found(module: str) -> bool:
 def compiling(name: str, sizes: tuple[int, int, int] = (1, 1, 1)) -> Iterator[Mesh]:
     """What is traced and compiled inside is for a mesh of `sizes` (data, fsdp, seq) of targets `name`.
 
-    Raises UserError where `missing` says why not.
+    Raises UserError as `check` does.
     """
-    if why := missing(name):
-        raise UserError(f"--compile: {why}.")
+    check(name)
     from jax.experimental import topologies
 
     count = math.prod(sizes)
@@ -177,6 +194,32 @@ def compiled(function: Callable, arguments: tuple, **jit: Any) -> Compiled:
         text=done.as_text(),
         options=options,
     )
+
+
+def report(said: dict[str, Compiled], name: str) -> str:
+    """What `--dry-run --compile` prints: programs by name."""
+    device, gb = target.TARGETS[name], 1e9
+    columns = ("arguments", "temporary", "all", "TFLOP", "moved")
+    lines = [
+        f"{f'compiled for {device.title}':42s}" + "".join(f"{column:>12s}" for column in columns)
+    ]
+    for program, one in said.items():
+        moved = sum(one.module.collectives.values())
+        cells = (
+            one.arguments / gb,
+            one.temporary / gb,
+            one.bytes / gb,
+            one.module.all_flops / 1e12,
+        )
+        row = "".join(f"{x:12,.3g}" for x in (*cells, moved / gb))
+        plain = (
+            "" if not one.options else "  without Triton's products: its default tiles do not fit"
+        )
+        lines.append(f"{program:42s}{row}{plain}")
+    lines.append(
+        "GB of one device, as its compiler allots them; NCCL's buffers and fragmentation are not in it"
+    )
+    return "\n".join(lines)
 
 
 def placed(tree: Any, where: Any) -> Any:

@@ -59,9 +59,12 @@ def test_targets_that_are_not_known_or_not_asked_for(program):
     arguments = program.parser().parse_args([*words, "--dry-run", "--target", "h10"])
     with pytest.raises(UserError, match="unknown device 'h10': did you mean 'h100'"):
         program.main(arguments)
-    arguments = program.parser().parse_args([*words, "--target", "h100"])
-    with pytest.raises(UserError, match="--dry-run"):
-        program.main(arguments)
+    for option in (["--target", "h100"], ["--compile"]):
+        with pytest.raises(UserError, match="--dry-run"):
+            program.main(program.parser().parse_args([*words, *option]))
+    with pytest.raises(UserError, match="--compile: nothing is compiled ahead of time for v5p"):
+        options = ["--dry-run", "--compile", "--target", "v5p"]
+        program.main(program.parser().parse_args([*words, *options]))
 
 
 # ---- the fused attention of GPUs on several devices ----------------------------------------------
