@@ -124,7 +124,8 @@ def _render(pyramid: Pyramid, size, way: Motion, blend: Blend, scale, cuts, heig
     head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
     mixed = head + rest + gate * (photos - head)
     # The mixture is cautious. Where the photos agree with one another they are taken as they are.
-    apart = (share * jnp.abs(colours - photos[None])).sum(0).mean(-1, keepdims=True)
+    apart = (share * jnp.abs(colours - photos[None])).sum(0)
+    apart = (apart[..., :1] + apart[..., 1:2] + apart[..., 2:]) / 3.0
     apart = _resized(_resized(apart / jnp.maximum(weight, EPS), h, w), height, width)
     trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * jnp.clip(weight / FADE, 0.0, 1.0)
     return jnp.clip(mixed + trust * (photos - mixed), 0.0, 1.0)
