@@ -46,7 +46,9 @@ def difference(values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Arra
     something in front. Where no pair sees a cut, half of what strangers cost.
     """
     close, pairs = jnp.zeros(seen.shape[1:]), jnp.zeros(seen.shape[1:])
-    channels = [values[..., c] for c in range(4)]  # sums along a last axis of four take ten times as long
+    channels = [
+        values[..., c] for c in range(4)
+    ]  # sums along a last axis of four take ten times as long
     for i in range(len(values)):
         for j in range(i):
             red, green, blue, structure = (jnp.abs(x[i] - x[j]) for x in channels)

@@ -31,7 +31,7 @@ from ..core.layers import (
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
 from .aggregate import settled, with_structure
-from .rendering import Blend, render
+from .rendering import Blend, Photos, render
 from .sweep import (
     EPS,
     SHARED,
@@ -59,9 +59,9 @@ UNSEEN = -8.0  # logit of cuts that no photo sees
 
 
 class Full(NamedTuple):
-    """Photos finer than the model's, and the size of the picture that is wanted of them."""
+    """Whole photos finer than the model's, and the size of the picture that is wanted of them."""
 
-    photos: jax.Array  # [m, ., ., 3] in [0, 1]; they show what the photos at the model's size show
+    photos: Photos
     height: int
     width: int
 
@@ -149,7 +149,8 @@ def look_up(
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
     alike = twins(photo_cameras[1])
-    structured = None if full is None else with_structure(photos)
+    wide = None if full is None else full.photos.shrunk()
+    structured = None if wide is None else with_structure(wide.rgb)
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
@@ -171,16 +172,16 @@ def look_up(
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         looked, _, (mixed, _, _) = choose(cut, found, seen)
         own = Looked(mixed, head, looked, coarse)
-        if structured is None:
+        if wide is None:
             return own, None
-        _, h, w, _ = photos.shape
-        where = pixels_of(h, w, 1)
-        values, seen = fetch(structured, way, where, all_cuts(cuts, h * w, reach))
+        h, w = photos.shape[1:3]
+        where, size = pixels_of(h, w, 1), (wide.size[:, 0], wide.size[:, 1])
+        way = wide.into(way)
+        values, seen = fetch(structured, way, where, all_cuts(cuts, h * w, reach), size)
         cut = settled(values, seen, alike, belief, h, w)
         inverse = inverse_depth(cut.reshape(1, -1), cuts, reach)
         found, seen = (
-            x.reshape(-1, h, w, x.size // (len(x) * h * w))
-            for x in fetch(photos, way, where, inverse)
+            x.reshape(len(x), h, w, -1) for x in fetch(wide.rgb, way, where, inverse, size)
         )
         _, share, (_, gate, rest) = choose(cut, found, seen)
         return own, Blend(cut, reach, share, gate, head, rest)
