@@ -4,20 +4,23 @@ Per scene, `context` photos are spread over a run of up to frames + context cons
 generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,
 `mean_context`, `plane` at the true median depth or, without depth, swept; `depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
+With `--size` all is compared at that size, whatever the model's own; the model's smaller frames are enlarged.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .data.two_sizes import Size, check_output, open_views
 from .errors import UserError
 from .files.entry import number, one_of
 from .files.folders import output_file, write_json
 
+SMALLEST = 32  # pixels on a side that LPIPS needs
 HELD_OUT = "procedural:1000000000..1000000049"
 
 
@@ -43,6 +46,17 @@ def parser() -> argparse.ArgumentParser:
         type=number(1),
         metavar="N",
         help="N views of each scene, every one from the --context photos nearest to it",
+    )
+    p.add_argument(
+        "--size",
+        type=size_of,
+        metavar="HEIGHTxWIDTH",
+        help="at which truth, photos and pictures are compared; smaller pictures are enlarged (default: the model's)",
+    )
+    p.add_argument(
+        "--lpips",
+        type=one_of(("alex", "vgg", "both", "none")),
+        help="trunk of LPIPS: alex, vgg, both, none (default: alex where its weights are installed)",
     )
     p.add_argument("--steps", type=number(1), help="sampling steps (default: the model's own)")
     p.add_argument("--solver", help="sampler (default: the model's own)")
@@ -118,58 +132,6 @@ def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[in
     return found
 
 
-Take = Callable[[list[int], list[int]], dict[str, Any]]
-
-
-def open_views(
-    name: str, views: int, size: tuple[int, int], sweep, convention: str | None = None
-) -> tuple[np.ndarray, Take]:
-    """The cameras c2w [v, 4, 4] of a scene (`views` of a procedural one), and what gives some of its views.
-
-    `take(context, target)` is a dict of what was asked for at generation size, contexts first: rgb [., h, w, 3], K, c2w
-    (float64), the targets' depth or None.
-    """
-    from .scenes import scene as scenes
-
-    if name.startswith("procedural:"):
-        from .procedural.scenes import SWEEP, sample_sequence
-
-        made = sample_sequence(
-            scenes.procedural_seed(name),
-            frames=views,
-            height=size[0],
-            width=size[1],
-            sweep=SWEEP if sweep is None else tuple(sweep),
-        )
-
-        def rendered(context: list[int], target: list[int]) -> dict[str, Any]:
-            order = context + target
-            return {
-                "rgb": made["rgb"][order].astype(np.float32) / 255.0,
-                "K": made["K"][order],
-                "c2w": made["c2w"][order],
-                "depth": made["depth"][target],
-                "context": context,
-                "target": target,
-            }
-
-        return made["c2w"], rendered
-    scene = scenes.load_scene(name, convention=convention)
-
-    def taken(context: list[int], target: list[int]) -> dict[str, Any]:
-        images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
-        return {
-            "rgb": images,
-            "K": np.asarray(cameras.K),
-            "c2w": np.asarray(cameras.c2w),
-            "depth": None,
-            "context": context,
-            "target": target,
-        }
-
-    return np.asarray(scene.cameras.c2w, np.float64), taken
-
-
 class Evaluator:
     """The model's jitted pieces, compiled once for all scenes of a size."""
 
@@ -201,7 +163,10 @@ class Evaluator:
         self.raise_if_failed = solvers.raise_if_failed
 
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
-        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the scene's targets."""
+        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, each at any size.
+
+        The scene's photos are at the model's size in `rgb`, `K` and at the output size in `output`.
+        """
         from .data.views import make_sample
         from .geometry.cameras import Cameras
         from .geometry.crops import resize
@@ -231,10 +196,10 @@ class Evaluator:
 
 
 def samples(
-    args: argparse.Namespace, name: str, frames: int, size: tuple[int, int]
+    args: argparse.Namespace, name: str, frames: int, size: Size, output: Size
 ) -> Iterator[dict[str, Any]]:
     """What is to be shown of one scene, as `take` of `open_views` gives it: one run, or with `close` many single views."""
-    c2w, take = open_views(name, frames + args.context, size, args.sweep, args.convention)
+    c2w, take = open_views(name, frames + args.context, size, args.sweep, args.convention, output)
     if args.close is None:
         yield take(*spread(len(c2w), args.context, frames))
     else:
@@ -263,22 +228,102 @@ def check_scenes(args: argparse.Namespace, names: list[str]) -> None:
             )
 
 
-def methods_of(
-    evaluator: Evaluator, scene: dict[str, Any], size: tuple[int, int]
-) -> dict[str, np.ndarray]:
-    """{method: [n, h, w, 3]} of the targets of one `take`: what the model makes, and what needs no learning."""
+def methods_of(evaluator: Evaluator, scene: dict[str, Any]) -> dict[str, np.ndarray]:
+    """{method: [n, h, w, 3]} of the targets of one `take` at its output size: the model's frames, enlarged where they come
+    smaller, and what needs no learning.
+    """
+    from .geometry.crops import resize
     from .metrics.baselines import baselines
 
-    m, (K, c2w) = len(scene["context"]), (scene["K"], scene["c2w"])
-    simple, _ = baselines(scene["rgb"][:m], K[:m], c2w[:m], K[m:], c2w[m:], size, scene["depth"])
-    return evaluator.videos(scene) | simple
+    m, c2w, judged = len(scene["context"]), scene["c2w"], scene["output"]
+    rgb, K = judged["rgb"], judged["K"]
+    size = rgb.shape[1:3]
+    simple, _ = baselines(rgb[:m], K[:m], c2w[:m], K[m:], c2w[m:], size, judged["depth"])
+    made = evaluator.videos(scene)
+    return {
+        name: np.stack([resize(np.clip(frame, 0.0, 1.0), *size) for frame in frames])
+        for name, frames in made.items()
+    } | simple
+
+
+def seen_in(scene: dict[str, Any]) -> np.ndarray | None:
+    """`metrics.seen.seen_by` of the targets of one `take`, [n, h, w]; None without true depth everywhere."""
+    from .metrics.seen import seen_by
+
+    judged, m, c2w = scene["output"], len(scene["context"]), scene["c2w"]
+    if judged["depth"] is None or judged["photo_depth"] is None:
+        return None
+    photos = (judged["photo_depth"], judged["K"][:m], c2w[:m])
+    targets = zip(judged["depth"], judged["K"][m:], c2w[m:])
+    return np.stack([seen_by(depth, K, pose, *photos) for depth, K, pose in targets])
+
+
+def evaluate_scene(
+    evaluator: Evaluator,
+    parts: list[dict[str, Any]],
+    learned: dict[str, Any],
+    close: bool,
+) -> tuple[dict[str, Any], list[np.ndarray], list[str]]:
+    """The numbers of one scene, and of its middle view the pictures and their names: photos, truth, methods."""
+    from .metrics.scores import scores
+    from .metrics.seen import pixel_split
+
+    row: dict[str, Any] = {}
+    for key in ("context", "target"):
+        row[key] = [part[key] for part in parts] if close else parts[0][key]
+    found: dict[str, list[dict[str, float]]] = {}
+    counted = []
+    for index, part in enumerate(parts):
+        photos, truth = np.split(part["output"]["rgb"], [len(part["context"])])
+        made, counts = methods_of(evaluator, part), seen_in(part)
+        order = {} if close else {"places": part["target"], "photos": part["context"]}
+        for method, frames in made.items():
+            numbers = scores(frames, truth, learned, counts=counts, **order)
+            found.setdefault(method, []).append(numbers)
+        if counts is not None:
+            counted.append(counts)
+        if index == len(parts) // 2:
+            middle = len(truth) // 2
+            pictures = [*photos, truth[middle], *(x[middle] for x in made.values())]
+            labels = [*(f"photo {i}" for i in range(len(photos))), "truth", *made]
+    if counted:
+        row["pixels"] = pixel_split(np.concatenate(counted))
+    for method, many in found.items():
+        row[method] = {k: float(np.mean([one[k] for one in many])) for k in many[0]}
+    return row, pictures, labels
+
+
+def learned_metrics(choice: str | None) -> dict[str, Any]:
+    """LPIPS by `--lpips`; if nothing was asked for, that of AlexNet or, without its weights, none and a note."""
+    from .metrics.learned import lpips_metrics
+
+    if choice == "none":
+        return {}
+    try:
+        return lpips_metrics(("alex", "vgg") if choice == "both" else (choice or "alex",))
+    except UserError as error:
+        if choice is not None:
+            raise
+        print(f"note: no LPIPS column. {error}")
+        return {}
+
+
+def size_of(text: str) -> Size:
+    """HEIGHTxWIDTH."""
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is no size: write HEIGHTxWIDTH in pixels, e.g. 192x336"
+        )
+    return int(height), int(width)
 
 
 def main(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
-    from .metrics import image, report
+    from .metrics import report
+    from .metrics.scores import SETTINGS
 
     output_file(args.out, "--out")
     if args.sheet:
@@ -290,38 +335,32 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     if args.sweep and not args.sweep[0] <= args.sweep[1]:
         raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
     check_scenes(args, names)
+    learned = learned_metrics(args.lpips)
     evaluator = Evaluator(
         args.checkpoint, args.solver or "", args.steps or 0, args.seed, args.schedule or ""
     )
     config = evaluator.config
     size = (config.height, config.width)
-    results, rows, methods = [], [], []
+    output = args.size or size
+    if args.size or learned:
+        check_output(output, size, SMALLEST)
+    results: list[dict[str, Any]] = []
+    rows: list[list[np.ndarray]] = []
+    labels: list[str] = []
     if args.context > config.max_context:
         raise UserError(
             f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
         )
     for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
-        parts = list(samples(args, name, config.frames, size))
-        made = [methods_of(evaluator, part, size) for part in parts]
-        row: dict[str, Any] = {"scene": Path(name).name or name}
-        for key in ("context", "target"):
-            row[key] = parts[0][key] if args.close is None else [part[key] for part in parts]
-        for method in made[0]:
-            found = [
-                image.image_metrics(np.clip(frames[method], 0.0, 1.0), part["rgb"][args.context :])
-                for frames, part in zip(made, parts)
-            ]
-            row[method] = {k: float(np.mean([one[k] for one in found])) for k in found[0]}
-        results.append(row)
-        methods += [method for method in made[0] if method not in methods]
-        frames, part = made[len(made) // 2], parts[len(parts) // 2]
-        photos, truth = np.split(part["rgb"], [args.context])
-        middle = len(truth) // 2
-        rows.append([*photos, truth[middle], *(x[middle] for x in frames.values())])
+        parts = list(samples(args, name, config.frames, size, output))
+        row, pictures, labels = evaluate_scene(evaluator, parts, learned, args.close is not None)
+        results.append({"scene": Path(name).name or name} | row)
+        rows.append(pictures)
     settings = {
         "checkpoint": str(args.checkpoint),
         "model": config.name,
-        "size": list(size),
+        "size": list(output),
+        "model_size": list(size),
         "context": args.context,
         "close": args.close,
         "frames": config.frames,
@@ -330,7 +369,8 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "schedule": evaluator.settings.schedule,
         "seed": args.seed,
         "sweep": args.sweep,
-        "metrics": image.SETTINGS,
+        "lpips": list(learned),
+        "metrics": SETTINGS,
     }
     document = report.build(settings, results, models=("generated", "rgb_head"))
     write_json(args.out, document)
@@ -339,7 +379,6 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     if args.sheet:
         from PIL import Image
 
-        labels = [*(f"photo {i}" for i in range(args.context)), "truth", *methods]
         sheet = report.contact_sheet(
             rows[:12], labels, row_labels=[r["scene"] for r in results[:12]]
         )
