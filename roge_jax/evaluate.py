@@ -2,7 +2,8 @@
 
 Per scene, `context` photos are spread over a run of up to frames + context consecutive views and the others are
 generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,
-`mean_context`, `plane` at the true median depth or, without depth, swept; `depth_warp` where depth is complete) and
+`mean_context`, `plane` at the true median depth or, without depth, swept; `plane_sweep`, depth by semi-global matching;
+`depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
 With `--size` all is compared at that size, whatever the model's own; the model's smaller frames are enlarged.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
@@ -234,11 +235,17 @@ def methods_of(evaluator: Evaluator, scene: dict[str, Any]) -> dict[str, np.ndar
     """
     from .geometry.crops import resize
     from .metrics.baselines import baselines
+    from .metrics.plane_sweep import sweep_view
 
     m, c2w, judged = len(scene["context"]), scene["c2w"], scene["output"]
     rgb, K = judged["rgb"], judged["K"]
     size = rgb.shape[1:3]
     simple, _ = baselines(rgb[:m], K[:m], c2w[:m], K[m:], c2w[m:], size, judged["depth"])
+    if m > 1:
+        swept = (
+            sweep_view(rgb[:m], K[:m], c2w[:m], *view, size).rgb for view in zip(K[m:], c2w[m:])
+        )
+        simple["plane_sweep"] = np.stack(list(swept))
     made = evaluator.videos(scene)
     return {
         name: np.stack([resize(np.clip(frame, 0.0, 1.0), *size) for frame in frames])

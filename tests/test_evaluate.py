@@ -36,7 +36,15 @@ def test_results_follow_the_contract(tiny, tmp_path, capsys):
     args += ["--steps", "2", "--out", str(out), "--sheet", str(sheet)]
     evaluate.main(evaluate.parser().parse_args(args))
     results = json.loads(out.read_text())
-    methods = {"generated", "rgb_head", "nearest", "mean_context", "plane", "vae_round_trip"}
+    methods = {
+        "generated",
+        "rgb_head",
+        "nearest",
+        "mean_context",
+        "plane",
+        "plane_sweep",
+        "vae_round_trip",
+    }
     assert methods <= set(results["means"])
     assert len(results["scenes"]) == 2
     for scene in results["scenes"]:
