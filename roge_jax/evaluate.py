@@ -6,6 +6,7 @@ generated as one video. The model (`generated`, `rgb_head`) stands beside what n
 `depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
 With `--size` all is compared at that size, whatever the model's own; the model's smaller frames are enlarged.
+A run that was stopped goes on, given the same words, with the scenes that it has in OUT.part.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
 """
 
@@ -19,7 +20,8 @@ import numpy as np
 from .data.two_sizes import Size, check_output, open_views
 from .errors import UserError
 from .files.entry import number, one_of
-from .files.folders import output_file, write_json
+from .files.folders import fingerprint_files, output_file, write_json
+from .files.parts import Item, load_item, parts, save_item
 
 SMALLEST = 32  # pixels on a side that LPIPS needs
 HELD_OUT = "procedural:1000000000..1000000049"
@@ -267,20 +269,20 @@ def seen_in(scene: dict[str, Any]) -> np.ndarray | None:
 
 def evaluate_scene(
     evaluator: Evaluator,
-    parts: list[dict[str, Any]],
+    views: list[dict[str, Any]],
     learned: dict[str, Any],
     close: bool,
-) -> tuple[dict[str, Any], list[np.ndarray], list[str]]:
+) -> Item:
     """The numbers of one scene, and of its middle view the pictures and their names: photos, truth, methods."""
     from .metrics.scores import scores
     from .metrics.seen import pixel_split
 
     row: dict[str, Any] = {}
     for key in ("context", "target"):
-        row[key] = [part[key] for part in parts] if close else parts[0][key]
+        row[key] = [part[key] for part in views] if close else views[0][key]
     found: dict[str, list[dict[str, float]]] = {}
     counted = []
-    for index, part in enumerate(parts):
+    for index, part in enumerate(views):
         photos, truth = np.split(part["output"]["rgb"], [len(part["context"])])
         made, counts = methods_of(evaluator, part), seen_in(part)
         order = {} if close else {"places": part["target"], "photos": part["context"]}
@@ -289,7 +291,7 @@ def evaluate_scene(
             found.setdefault(method, []).append(numbers)
         if counts is not None:
             counted.append(counts)
-        if index == len(parts) // 2:
+        if index == len(views) // 2:
             middle = len(truth) // 2
             pictures = [*photos, truth[middle], *(x[middle] for x in made.values())]
             labels = [*(f"photo {i}" for i in range(len(photos))), "truth", *made]
@@ -297,7 +299,7 @@ def evaluate_scene(
         row["pixels"] = pixel_split(np.concatenate(counted))
     for method, many in found.items():
         row[method] = {k: float(np.mean([one[k] for one in many])) for k in many[0]}
-    return row, pictures, labels
+    return Item(row, pictures, labels)
 
 
 def learned_metrics(choice: str | None) -> dict[str, Any]:
@@ -329,6 +331,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
+    from .checkpoint import find_model
     from .metrics import report
     from .metrics.scores import SETTINGS
 
@@ -351,20 +354,13 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     output = args.size or size
     if args.size or learned:
         check_output(output, size, SMALLEST)
-    results: list[dict[str, Any]] = []
-    rows: list[list[np.ndarray]] = []
-    labels: list[str] = []
     if args.context > config.max_context:
         raise UserError(
             f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
         )
-    for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
-        parts = list(samples(args, name, config.frames, size, output))
-        row, pictures, labels = evaluate_scene(evaluator, parts, learned, args.close is not None)
-        results.append({"scene": Path(name).name or name} | row)
-        rows.append(pictures)
     settings = {
         "checkpoint": str(args.checkpoint),
+        "weights": fingerprint_files(find_model(args.checkpoint), "config.json", "*.safetensors"),
         "model": config.name,
         "size": list(output),
         "model_size": list(size),
@@ -376,18 +372,34 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "schedule": evaluator.settings.schedule,
         "seed": args.seed,
         "sweep": args.sweep,
+        "convention": args.convention,
         "lpips": list(learned),
-        "metrics": SETTINGS,
     }
-    document = report.build(settings, results, models=("generated", "rgb_head"))
-    write_json(args.out, document)
+    items = []
+    with parts(args.out, settings) as folder:
+        for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
+            item = load_item(folder, name, pictures=bool(args.sheet))
+            if item is None:
+                views = list(samples(args, name, config.frames, size, output))
+                item = evaluate_scene(evaluator, views, learned, args.close is not None)
+                save_item(folder, name, item, pictures=bool(args.sheet))
+            items.append(item)
+        results = [
+            {"scene": Path(name).name or name} | item.row for name, item in zip(names, items)
+        ]
+        document = report.build(
+            settings | {"metrics": SETTINGS}, results, models=("generated", "rgb_head")
+        )
+        write_json(args.out, document)
     print(report.table(document))
     print(f"wrote {args.out}")
     if args.sheet:
         from PIL import Image
 
         sheet = report.contact_sheet(
-            rows[:12], labels, row_labels=[r["scene"] for r in results[:12]]
+            [item.pictures for item in items[:12]],
+            items[0].labels,
+            row_labels=[r["scene"] for r in results[:12]],
         )
         few = Image.fromarray(sheet).quantize(255, kmeans=2, dither=Image.Dither.NONE)  # a third
         few.save(args.sheet, optimize=True)

@@ -139,6 +139,42 @@ def test_at_another_size_everything_is_compared_there(tiny, tmp_path, monkeypatc
     assert "lpips_alex" not in row["generated"]
 
 
+def test_a_stopped_run_goes_on_and_other_settings_are_refused(tiny, tmp_path, monkeypatch):
+    """Stopped at the third scene: the first two are not computed again, and the document is that of one go."""
+    words = ["--checkpoint", str(tiny), "--context", "2", "--steps", "2", "--lpips", "none"]
+    words += ["--scenes", "procedural:1000000000..1000000002"]
+    done = []
+    own = evaluate.evaluate_scene
+
+    def counted(*args):
+        if len(done) == 2 and state:
+            raise KeyboardInterrupt
+        done.append(args)
+        return own(*args)
+
+    def run(out, *more):
+        told = [*words, "--out", str(out), "--sheet", str(out.with_suffix(".png")), *more]
+        return evaluate.main(evaluate.parser().parse_args(told))
+
+    state = []
+    whole = run(tmp_path / "whole.json")
+    monkeypatch.setattr(evaluate, "evaluate_scene", counted)
+    out, state = tmp_path / "r.json", ["stop"]
+    with pytest.raises(KeyboardInterrupt):
+        run(out)
+    assert not out.exists() and len(list((tmp_path / "r.json.part").glob("*.npz"))) == 2
+    with pytest.raises(UserError, match=r"holds a run with steps 2, and 1 is asked for"):
+        run(out, "--steps", "1")
+    done.clear()
+    state.clear()
+    again = run(out)
+    assert len(done) == 1 and not (tmp_path / "r.json.part").exists()
+    assert json.loads(out.read_text()) == json.loads((tmp_path / "whole.json").read_text())
+    assert again["means"] == whole["means"]
+    assert out.with_suffix(".png").read_bytes() == (tmp_path / "whole.png").read_bytes()
+    run(out, "--steps", "1")  # a finished file is written anew
+
+
 def test_without_lpips_weights_a_note_says_how_to_get_them(monkeypatch, capsys):
     from roge_jax.metrics import lpips_package
 
