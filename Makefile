@@ -9,13 +9,13 @@ BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
 CODE := roge_jax tests experiments
-# Experiments that draw something; stored sampling grids come first, because the charts use them. Left out: parts of other
-# experiments, and comparisons with PyTorch (`make compare`).
-PARTS := experiments/plan_report.py experiments/plan_runs.py experiments/robustness_report.py \
-	experiments/robustness_matching.py experiments/training_curves.py
-COMPARISONS := experiments/dit_speed.py experiments/vae_speed.py experiments/real_size.py
-FIGURES := experiments/optimise_schedules.py \
-	$(filter-out experiments/optimise_schedules.py $(PARTS) $(COMPARISONS),$(wildcard experiments/*.py))
+# Programs of the experiments; stored sampling grids come first, because the charts use them. Left out: what `figures`
+# only draws, and comparisons with PyTorch (`make compare`).
+EXPERIMENTS := $(subst /,.,$(basename $(shell grep -l '^if __name__' experiments/*/*.py)))
+DRAWN := experiments.quality.training_curves
+COMPARISONS := experiments.speed.dit experiments.speed.vae experiments.speed.real_size
+FIRST := experiments.quality.optimise_schedules
+FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS),$(EXPERIMENTS)))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help
@@ -61,11 +61,11 @@ figures: $(DEV)  ## every chart and table again; writes experiments/results (hou
 	$(RUN) -m roge_jax.evaluate --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
 	$(RUN) -m roge_jax.evaluate --sweep 100 130 --out experiments/results/mini_wide.json
 	$(RUN) -m roge_jax.procedural sheet --out docs/procedural.png
-	$(RUN) experiments/training_curves.py --draw
-	@for f in $(FIGURES); do echo "== $$f"; $(RUN) $$f || exit 1; done
+	$(RUN) -m $(DRAWN) --draw
+	@for f in $(FIGURES); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
 
 compare: $(PARITY)  ## speed beside PyTorch (installs torch and diffusers); writes experiments/results
-	@for f in $(COMPARISONS); do echo "== $$f"; $(RUN) $$f || exit 1; done
+	@for f in $(COMPARISONS); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
 
 notebook: $(DEV)  ## run the notebook; the executed copy is outputs/from_rays_to_video.ipynb
 	@mkdir -p outputs

@@ -26,6 +26,7 @@ from roge_jax.geometry.cameras import (
     inspect,
     normalise,
     other_conventions,
+    turn,
 )
 from roge_jax.geometry.crops import cover_window
 from roge_jax.geometry.trajectories import focus_distance
@@ -35,6 +36,7 @@ from roge_jax.scenes.matching import pose_agreement
 from roge_jax.scenes.scene import Scene, is_nerfstudio, open_scene
 
 BAD_FIT = 3.0  # pixels of median epipolar distance: good poses 0.1 to 1, wrong axes 20 and more
+GOOD_FIT = 1.0  # what another convention must reach to be named
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +81,7 @@ def check(config: Config) -> Report:
         finding = Finding("error", "scene", str(error).rstrip("."), "nothing else was looked at")
         return Report(config.scene, {}, [finding])
     heights, widths = zip(*scene.sizes, strict=True)
-    cameras, findings = inspect(scene.cameras, heights, widths, scene.names)
+    cameras, findings = inspect(scene.cameras, heights, widths, scene.names, scene.axes)
     findings = [*scene.notes, *findings]
     broken = any(finding.severity == "error" for finding in findings)
     numbers: dict[str, Any] = {"photos": len(scene), "sizes": _sizes(scene)}
@@ -186,7 +188,8 @@ def _about_agreement(
     """Whether matched features fit the poses, and if not, whether another convention would."""
     now = config.convention or ("opengl" if is_nerfstudio(scene.source) else "opencv")
     others = other_conventions(cameras, now)
-    candidates = {now: cameras} | others
+    causes = other_causes(scene, cameras)
+    candidates = {now: cameras} | others | {name: one for name, (one, _) in causes.items()}
     try:
         distances, pairs = pose_agreement(scene.images, candidates)
     except ImportError:
@@ -199,12 +202,31 @@ def _about_agreement(
     if distances[now] <= BAD_FIT:
         return numbers, []
     what = f"matched features lie {distances[now]:.1f} pixels from where the poses put them"
-    if distances[best] < min(BAD_FIT, distances[now] / 3):
+    cause = min(causes, key=lambda c: distances[c])
+    if distances[cause] < min(distances[best], GOOD_FIT, distances[now] / 3):
+        fix = f"{causes[cause][1]}; so read it is {distances[cause]:.2f}"
+        return numbers, [Finding("error", "poses", what, fix)]
+    if distances[best] < min(GOOD_FIT, distances[now] / 3):
         fix = f"read as '{best}' it is {distances[best]:.2f}: give --convention {best}"
         fix += f" (in Python convention='{best}')"
         return numbers, [Finding("error", "poses", what, fix)]
     fix = "check intrinsics, picture order and poses (moving things also do this)"
     return numbers, [Finding("warning", "poses", what, fix)]
+
+
+def other_causes(scene: Scene, cameras: Cameras) -> dict[str, tuple[Cameras, str]]:
+    """What else than axes makes right poses fit badly: {name: (cameras that would fit then, what to do)}."""
+    turned = [
+        turn(K, pose, 2, *size)
+        for K, pose, size in zip(cameras.K, cameras.c2w, scene.sizes, strict=True)
+    ]
+    upside = Cameras(np.stack([K for K, _ in turned]), np.stack([pose for _, pose in turned]))
+    shift = "the photos have the poses of their neighbours: correct the names or the order"
+    return {
+        "upside down": (upside, "the photos are upside down: turn them, or correct their EXIF tag"),
+        "the next": (Cameras(cameras.K, np.roll(cameras.c2w, -1, 0)), shift),
+        "the one before": (Cameras(cameras.K, np.roll(cameras.c2w, 1, 0)), shift),
+    }
 
 
 def render(report: Report) -> str:

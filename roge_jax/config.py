@@ -3,9 +3,10 @@
 import dataclasses
 import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from .errors import UserError, did_you_mean
+from .files.fields import described, fits
 
 WAN_LATENT_MEAN = (
     -0.7571, -0.7089, -0.9113, 0.1075, -0.1745, 0.9653, -0.1517, 1.5508,
@@ -133,6 +134,9 @@ class RoGeConfig:
     width: int = 336
     recon_height: int = 288  # of the images and rays of the reconstruction branch
     recon_width: int = 504
+    # (height, width) of the pictures that are made where the photos' own pixels are read (`renderer.lookup`), if it is
+    # not the generated video's; any other can be asked for.
+    output: tuple[int, ...] | None = None
     frames: int = 81  # per window, 1 + 4k
     max_context: int = 9
     scale_rule: Literal["lagernvs", "paper"] = "lagernvs"
@@ -163,11 +167,61 @@ class RoGeConfig:
                 f"renderer.lookup {self.renderer.lookup} with patches of {p} pixels does not fit: give 0 or at least 2 "
                 "cuts, and a patch that is a multiple of 4."
             )
+        if self.output is not None and (
+            len(self.output) != 2
+            or self.output[0] < self.recon_height
+            or self.output[1] < self.recon_width
+        ):
+            raise UserError(
+                f"Output size {self.output} does not fit: give two numbers, at least {self.recon_height} and "
+                f"{self.recon_width}, or null."
+            )
         if self.frames < 1 or self.frames % 4 != 1:
             k = max(self.frames - 1, 0) // 4
             raise UserError(
                 f"{self.frames} frames cannot form latent slots: need 1 + 4k, e.g. {1 + 4 * k} or {5 + 4 * k}."
             )
+
+    @property
+    def output_size(self) -> tuple[int, int]:
+        """(height, width) of the pictures that are made."""
+        if self.output is None or not self.renderer.lookup:
+            return self.height, self.width
+        return self.output[0], self.output[1]
+
+    def at_size(
+        self, height: int, width: int, recon: tuple[int, int] | None = None
+    ) -> "RoGeConfig":
+        """The model at another size; its pictures grow with it. `recon`: the reconstruction's, by default in proportion."""
+        patch = self.renderer.patch
+        ratio = height / max(self.height, 1), width / max(self.width, 1)
+        if recon is None:
+            recon = (
+                max(patch, round(self.recon_height * ratio[0] / patch) * patch),
+                max(patch, round(self.recon_width * ratio[1] / patch) * patch),
+            )
+        output = self.output
+        if output is not None:
+            output = (round(output[0] * ratio[0]), round(output[1] * ratio[1]))
+        return dataclasses.replace(
+            self,
+            height=height,
+            width=width,
+            recon_height=recon[0],
+            recon_width=recon[1],
+            output=output,
+        )
+
+    def for_pictures(self, height: int, width: int) -> "RoGeConfig":
+        """The model for pictures of this size: where colours come from the photos, at about as many pixels as it was made
+        for and in the picture's shape; else at the picture's size itself."""
+        pixels = 8 * self.dit.patch
+        if not self.renderer.lookup or height * width <= self.height * self.width:
+            return dataclasses.replace(self, output=None).at_size(height, width)
+        side = math.sqrt(self.height * self.width / (height * width))
+        small = [min(_nearest(side * x, pixels), x) for x in (height, width)]
+        model = dataclasses.replace(self, output=None).at_size(small[0], small[1])
+        return dataclasses.replace(model, output=(height, width))
 
     @property
     def latent_size(self) -> tuple[int, int]:
@@ -179,7 +233,7 @@ class RoGeConfig:
         return contexts + 1 + (self.frames - 1) // 4
 
 
-def _nearest(size: int, multiple: int) -> int:
+def _nearest(size: float, multiple: int) -> int:
     return max(multiple, round(size / multiple) * multiple)
 
 
@@ -212,6 +266,7 @@ def _mini() -> RoGeConfig:
         width=112,
         recon_height=64,
         recon_width=112,
+        output=(192, 336),
         frames=17,
         max_context=6,
         encoder=EncoderConfig(
@@ -289,8 +344,8 @@ def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
             value = from_dict(value, default, source=f"{source}.{name}")
         else:
             value = tuple(value) if isinstance(value, list) else value
-            if not _fits(value, hints[name]):
-                raise UserError(f"{source}: '{name}' is {value!r}: give {_described(hints[name])}.")
+            if not fits(value, hints[name]):
+                raise UserError(f"{source}: '{name}' is {value!r}: give {described(hints[name])}.")
         built[name] = value
     for name in POSITIVE:
         if name in built and built[name] <= 0:
@@ -354,42 +409,3 @@ def _checked_preview(cfg: RoGeConfig, source: str) -> RoGeConfig:
             f"{source}.fusion: 'preview_std' needs 'preview' and {channels} positive values, one per latent channel."
         )
     return cfg
-
-
-def _fits(value, hint) -> bool:
-    """Whether a value read from JSON is of the kind that a field's type hint asks for; whole numbers are not negative."""
-    kind, arguments = get_origin(hint), get_args(hint)
-    if kind is Literal:
-        return value in arguments and not isinstance(value, bool)
-    if kind is tuple:
-        return (
-            isinstance(value, tuple)
-            and len(value) > 0
-            and all(_fits(x, arguments[0]) for x in value)
-        )
-    if kind is not None:  # a union
-        return any(_fits(value, option) for option in arguments)
-    if hint is float:
-        return (
-            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        )
-    if hint is int:
-        return isinstance(value, int) and not isinstance(value, bool) and value >= 0
-    return isinstance(value, hint)
-
-
-def _described(hint) -> str:
-    kind, arguments = get_origin(hint), get_args(hint)
-    if kind is Literal:
-        return "one of " + ", ".join(map(str, arguments))
-    if kind is tuple:
-        return f"a list, of each {_described(arguments[0])}"
-    if kind is not None:
-        return " or ".join(_described(option) for option in arguments)
-    words = {
-        int: "a whole number of at least 0",
-        float: "a number",
-        bool: "true or false",
-        str: "a word",
-    }
-    return words.get(hint, "null")

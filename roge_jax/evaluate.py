@@ -5,12 +5,13 @@ generated as one video. The model (`generated`, `rgb_head`) stands beside what n
 `mean_context`, `plane` at the true median depth or, without depth, swept; `plane_sweep`, depth by semi-global matching;
 `depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
-With `--size` all is compared at that size, whatever the model's own; the model's smaller frames are enlarged.
+All is compared at `--size`, whatever the model's own; frames that the model makes smaller are enlarged.
 A run that was stopped goes on, given the same words, with the scenes that it has in OUT.part.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
 """
 
 import argparse
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from .data.two_sizes import Size, check_output, open_views
+from .data.two_sizes import spread as spread
 from .errors import UserError
 from .files.entry import number, one_of
 from .files.folders import fingerprint_files, output_file, write_json
@@ -54,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
         "--size",
         type=size_of,
         metavar="HEIGHTxWIDTH",
-        help="at which truth, photos and pictures are compared; smaller pictures are enlarged (default: the model's)",
+        help="at which truth, photos and pictures are compared; smaller pictures are enlarged\n(default: that of the pictures that the model makes)",
     )
     p.add_argument(
         "--lpips",
@@ -104,18 +106,6 @@ def expand(specs: list[str]) -> list[str]:
     return names
 
 
-def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]]:
-    """(context ids, target ids) of a scene: a centred run of views, contexts in the middle of equal parts of it."""
-    run = min(views, frames + contexts)
-    if run <= contexts:
-        raise UserError(
-            f"{views} views cannot give {contexts} contexts and a target: use fewer with --context."
-        )
-    start = (views - run) // 2
-    context = [start + int((i + 0.5) * run / contexts) for i in range(contexts)]
-    return context, [i for i in range(start, start + run) if i not in context]
-
-
 def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[int], list[int]]]:
     """(context ids, the target alone) of up to `count` views, evenly over all: the views nearest to each, nearest first.
 
@@ -151,6 +141,7 @@ class Evaluator:
         from .sampling.windows import window_noise
         from .video import flow, solvers, vae
 
+        self._prepare: dict[Size, Any] = {}
         self.params, self.config = load_model(checkpoint)
         config = self.config
         self.settings = s = sampling.Settings(steps, solver, schedule).of(config)
@@ -158,22 +149,37 @@ class Evaluator:
             s.schedule, s.steps, shift=config.flow.shift, solver=s.solver, model=config.name
         )
         table = solvers.tabulate(s.solver, grid)
-        self.prepare = jax.jit(functools.partial(model.prepare, config=config))
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
         self.noise = functools.partial(window_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
 
-    def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
-        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, each at any size.
+    def prepare(self, size: Size):
+        """`model.prepare`, jitted, with the reconstruction's picture also at `size` if the model can make it so large."""
+        import functools
 
-        The scene's photos are at the model's size in `rgb`, `K` and at the output size in `output`.
+        import jax
+
+        from . import model
+
+        if size not in self._prepare:
+            config = self.config
+            own = (config.height, config.width)
+            least = (config.recon_height, config.recon_width)
+            larger = size != own and size[0] >= least[0] and size[1] >= least[1]
+            config = dataclasses.replace(config, output=size if larger else None)
+            self._prepare[size] = jax.jit(functools.partial(model.prepare, config=config)), config
+        return self._prepare[size]
+
+    def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
+        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, at the model's size or,
+        of models that read colours from the photos, at the output size, from the photos of that size.
         """
         from .data.views import make_sample
         from .geometry.cameras import Cameras
-        from .geometry.crops import resize
         from .geometry.packing import pad_path
+        from .sampling.video import at_output
 
         m, n, frames = len(scene["context"]), len(scene["target"]), self.config.frames
         path = pad_path(Cameras(scene["K"][m:], scene["c2w"][m:]), frames)
@@ -184,17 +190,21 @@ class Evaluator:
         rgb = np.concatenate([scene["rgb"], np.repeat(scene["rgb"][-1:], frames - n, 0)])
         views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
         truth = views.pop("target_rgb")
-        prepared = self.prepare(self.params, views)
+        photos = scene["output"]["rgb"][:m]
+        prepare, config = self.prepare(photos.shape[1:3])
+        if config.output_size != (config.height, config.width):
+            views["context_full"] = np.asarray(photos, np.float32)
+        prepared = prepare(self.params, views)
         latents, info = self.generate(self.params, prepared, self.noise(m))
         self.raise_if_failed(info)
-        h, w = truth.shape[1:3]
-        head = np.asarray(prepared.shown)
+        video = np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n]
+        shown = np.asarray(prepared.shown)[:n]
+        full = None if prepared.full is None else np.asarray(prepared.full)[:n]
+        encoded = self.encode(self.params["vae"], 2.0 * truth - 1.0)
         return {
-            "generated": np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n],
-            "rgb_head": np.stack([resize(image, h, w) for image in head[:n]]),
-            "vae_round_trip": np.asarray(
-                self.decode(self.params, self.encode(self.params["vae"], 2.0 * truth - 1.0))
-            )[:n],
+            "generated": video if full is None else at_output(video, shown, full, config),
+            "rgb_head": shown if full is None else full,
+            "vae_round_trip": np.asarray(self.decode(self.params, encoded))[:n],
         }
 
 
@@ -351,7 +361,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     )
     config = evaluator.config
     size = (config.height, config.width)
-    output = args.size or size
+    output = args.size or config.output_size
     if args.size or learned:
         check_output(output, size, SMALLEST)
     if args.context > config.max_context:

@@ -9,6 +9,7 @@ itself). A scene's `views` are a dict of arrays, contexts first:
     vectors     [m, 11]                     `geometry.cameras.camera_vector` of the contexts
     target_rgb  [n, h, w, 3] in [0, 1]      training only
     context_recon, target_recon             optional: the same views at reconstruction size
+    context_full  [m, ., ., 3]              optional: the contexts, finer; sampling reads colours from them
 """
 
 import functools
@@ -32,7 +33,7 @@ from .geometry.rays import plucker
 from .recon import ray_scene, vggt
 from .recon.picture import decode_rgb as decode_rgb
 from .recon.picture import only_targets as only_targets
-from .recon.picture import recon_cameras, recon_photos, show
+from .recon.picture import recon_cameras, recon_photos, show, show_all
 from .recon.relative import Relative, relative_cameras
 from .video import dit, flow, solvers, vae, vae_training
 
@@ -356,6 +357,9 @@ class Prepared(NamedTuple):
     condition: Condition
     text: Tree | None
     detail: jax.Array | None  # [n, h, w, 3], see `preview.lost_detail`
+    full: jax.Array | None = (
+        None  # [n, H, W, 3]: `shown` at the output's size, where views have `context_full`
+    )
 
 
 def prepare(
@@ -366,10 +370,11 @@ def prepare(
         scene_tokens = reconstruct(params, views, config=config)
     features = query_rays(params, scene_tokens, views, config=config)
     latents = encode_contexts(params, views["context_rgb"], config=config)
-    shown = show(params, features, views, config=config)
+    shown, full = show_all(params, features, views, config=config, full=True)
     cond = condition(params, latents, features, views, config=config, shown=shown)
     detail = preview.lost_detail(params, shown, cond, config=config)
-    return Prepared(latents, features, shown, cond, text_cache(params, config=config), detail)
+    text = text_cache(params, config=config)
+    return Prepared(latents, features, shown, cond, text, detail, full)
 
 
 def draw_noise(key: jax.Array, contexts: int, *, config: RoGeConfig) -> jax.Array:

@@ -19,6 +19,7 @@ from .files.entry import Clock, environment, number, one_of, run
 from .files.folders import output_folder, write_json
 from .sampling.inputs import (
     ALONE,
+    FPS,
     MOST_FRAMES,
     SCENE,
     THROUGH,
@@ -37,7 +38,8 @@ def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.sample`."""
     from .geometry.cameras import CONVENTIONS
     from .geometry.trajectories import PRESETS
-    from .sampling.video import DEFAULT_CONTEXT, LONG, SLOTS
+    from .sampling.photos import DEFAULT_CONTEXT
+    from .sampling.video import LONG, SLOTS
     from .video.flow import SCHEDULES
     from .video.solver_table import SOLVERS
 
@@ -56,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", SCENE)
     paths = ", ".join(sorted(PRESETS))
     path_help = (
-        f"a .json path file, or {paths}; options after a colon: orbit:degrees=90,swing=false "
+        f"a path file or a scene's own file or folder, or {paths}; options after a colon: orbit:degrees=90,swing=false "
         f"(default: {THROUGH}; of a single photo {ALONE})"
     )
     option("--trajectory", path_help, metavar="NAME|FILE")
@@ -72,10 +74,13 @@ def parser() -> argparse.ArgumentParser:
         f"name, with commas ('4,' is photo 4 alone), the first being the world frame; up to {DEFAULT_CONTEXT} if not given"
     )
     option("--context", ids_help, metavar="M|IDS")
-    axes_help = (
-        f"axes of the poses of a transforms.json that are not OpenGL: {', '.join(CONVENTIONS)}"
-    )
+    axes_help = f"axes of the poses of a transforms.json that are not OpenGL, of the path too: {', '.join(CONVENTIONS)}"
     option("--convention", axes_help, type=one_of(CONVENTIONS))
+    frame_help = (
+        "coordinates of a path file: scene, first (starts at the first photo; first:SCALE), nerfstudio's "
+        "dataparser_transforms.json, or a 3x4 or 4x4 matrix by rows and a scale, with commas; found out if not given"
+    )
+    option("--path-frame", frame_help, metavar="WHERE")
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
     option("--size", "HEIGHTxWIDTH in pixels; the model's own if not given")
@@ -90,7 +95,8 @@ def parser() -> argparse.ArgumentParser:
     )
     option("--tolerance", tolerance_help, type=number(0, whole=False))
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)
-    option("--fps", "frames per second", 16.0, type=number(1e-3, 1000, whole=False))
+    fps_help = f"frames per second; the path file's own, else {FPS:g}"
+    option("--fps", fps_help, type=number(1e-3, 1000, whole=False))
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     mesh_help = "how to split the work over devices, e.g. fsdp=2,seq=2: weights; tokens and views (one device if not given)"
     option("--mesh", mesh_help)

@@ -9,12 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import quick_xla
 
 ROOT = Path(__file__).parent.parent
-# Helpers lie in support/; a few tests use what a neighbour made.
-sys.path[:0] = [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]
-
-import quick_xla  # noqa: E402
 
 HOST_DEVICES = 8
 

@@ -1,1 +1,1 @@
-"""Measuring the trained model: scenes, measures, knobs and charts of `mini_quality.py`."""
+"""How good results are, and for what cost."""

@@ -1,7 +1,8 @@
 """Charts and tables of mini_quality.json."""
 
-from pathlib import Path
 from typing import Any
+
+from experiments import harness
 
 Report = dict[str, Any]
 COLOURS = {
@@ -32,13 +33,9 @@ ROWS = (
 )  # fmt: skip
 
 
-def samplers(report: Report, path: Path) -> None:
+def samplers(report: Report, name: str) -> None:
     """Rows: ROWS. Columns: schedules. Shaded: intervals over scenes; horizontal bars: the slowest and fastest run."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = harness.pyplot()
     seen_in = {r["schedule"] for r in report["records"]}
     schedules = [s for s in SCHEDULES if s in seen_in or s == "optimised"]
     default = report["verdict"]["default"].split()
@@ -64,7 +61,6 @@ def samplers(report: Report, path: Path) -> None:
                         ax.plot(*at, "o", ms=14, mfc="none", mec="k", mew=1.6, zorder=5)
         for ax, (x, metric, label) in zip(axes[:, column], ROWS):
             ax.set_xscale("log")
-            ax.grid(True, which="major", alpha=0.25)
             if x == "evaluations":
                 ticks = [1, 2, 4, 6, 8, 12, 20]
                 ax.set_xticks(ticks, [str(t) for t in ticks])
@@ -96,21 +92,9 @@ def samplers(report: Report, path: Path) -> None:
         for handle, label in zip(*ax.get_legend_handles_labels()):
             seen.setdefault(label, handle)
     seen["default"] = plt.Line2D([], [], ls="", marker="o", ms=11, mfc="none", mec="k", mew=1.6)
-    fig.legend(seen.values(), seen, loc="lower center", ncol=2 * columns, frameon=False)
+    fig.legend(seen.values(), seen, loc="lower center", ncol=2 * columns)
     fig.tight_layout(rect=(0, 0.6 / size[1], 1, 1))
-    save(fig, path)
-    plt.close(fig)
-
-
-def save(fig: Any, path: Path) -> None:
-    """A PNG of 256 colours: half the size, the same picture."""
-    import io
-
-    from PIL import Image
-
-    raw = io.BytesIO()
-    fig.savefig(raw, dpi=75)
-    Image.open(raw).convert("RGB").quantize(256).save(path, optimize=True)
+    harness.save(fig, name)
 
 
 def work(record: dict, x: str) -> float:
@@ -148,13 +132,9 @@ def plain_seconds(ax, seconds: list[float]) -> None:
     ax.set_xlim(low, high)
 
 
-def knobs(report: Report, path: Path) -> None:
+def knobs(report: Report, name: str) -> None:
     """Photos, steps of the peers, size, precision, caches and refinement."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
+    plt = harness.pyplot()
     records = report["knobs"]
     fig, axes = plt.subplots(2, 4, figsize=(20, 9))
 
@@ -185,7 +165,7 @@ def knobs(report: Report, path: Path) -> None:
             ylabel=label,
             xticks=sorted({r["value"] for r in records if r["knob"] == "M"}),
         )
-    axes[0, 2].legend(fontsize=8, loc="best")
+    axes[0, 2].legend(loc="best")
 
     ax = axes[1, 0]
     solver, schedule, _ = report["verdict"]["default"].split()
@@ -204,7 +184,7 @@ def knobs(report: Report, path: Path) -> None:
     ax.set_xticks(ticks, [str(t) for t in ticks])
     ax.minorticks_off()
     ax.set(xlabel="velocity evaluations (3 photos)", ylabel="PSNR to the truth, dB")
-    ax.legend(fontsize=8)
+    ax.legend()
 
     def point(ax, r, metric, colour, marker="o", text="", below=False):
         v, s = r["metrics"][metric], r["seconds"]
@@ -242,7 +222,7 @@ def knobs(report: Report, path: Path) -> None:
     ax.plot(at, [r["metrics"]["latent_error"]["mean"] for r in full], color="#d62728", lw=1, marker=".", label=f"{solver} {schedule}, other step counts")  # fmt: skip
     ax.set(yscale="log", ylabel="relative L2 error of the latents", title="block cache (squares) against exact (dots)")  # fmt: skip
     plain_seconds(ax, spread_of([*full, *cached], 25))
-    ax.legend(fontsize=8)
+    ax.legend()
 
     ax = axes[1, 3]
     toys = [r for r in records if r["knob"] == "refinement"]
@@ -251,34 +231,22 @@ def knobs(report: Report, path: Path) -> None:
         across = [[s["median"] - s["fastest"]], [s["slowest"] - s["median"]]]
         gap = r["relative_difference_of_features"]
         ax.errorbar(s["median"], gap, None, across, fmt="o", color="k", capsize=3)
-        name = {"per_view": "exact (per view)"}.get(r["value"], r["value"])
-        ax.annotate(f"{name}\ndiffers by {gap:.3f}", (s["median"], gap), xytext=(7, 8), textcoords="offset points", fontsize=8)  # fmt: skip
+        kind = {"per_view": "exact (per view)"}.get(r["value"], r["value"])
+        ax.annotate(f"{kind}\ndiffers by {gap:.3f}", (s["median"], gap), xytext=(7, 8), textcoords="offset points", fontsize=8)  # fmt: skip
     top = max((r["relative_difference_of_features"] for r in toys), default=0.0)
     ax.set(ylim=(-0.1 * top, 1.3 * top or 1.0), ylabel="relative L2 difference of ray features", title="refinement of scene tokens, random toy")  # fmt: skip
     plain_seconds(ax, spread_of(toys, 2))
     ax.set_xlabel("seconds, all views (ray features)")
     for ax in (axes[0, 3], axes[1, 1], axes[1, 2]):
         ax.set_xlabel("seconds a scene (sampling)")
-    for ax in axes.flat:
-        ax.grid(True, alpha=0.25)
     fig.tight_layout()
-    save(fig, path)
-    plt.close(fig)
+    harness.save(fig, name)
 
 
 def spread_of(records: list[dict], room: float) -> list[float]:
     """All seconds of `records`, and `room` times the largest for what is written beside it."""
     seconds = [s for r in records for s in r["seconds"].values()]
     return [*seconds, room * max(seconds)]
-
-
-def with_tables(text: str, report: Report) -> str:
-    """The document with everything between the markers written anew."""
-    begin, end = "<!-- mini_quality: written by the experiment -->", "<!-- /mini_quality -->"
-    head, _, rest = text.partition(begin)
-    assert rest, f"docs/solvers.md lacks the marker {begin}"
-    _, _, tail = rest.partition(end)
-    return f"{head}{begin}\n{tables(report)}\n{end}{tail}"
 
 
 def goals(verdict: dict[str, Any]) -> list[str]:
@@ -320,9 +288,8 @@ def tables(report: Report) -> str:
         "",
         "Closest to the reference within each number of evaluations, on each schedule:",
         "",
-        "| evaluations | schedule | solver, steps | latent error | PSNR minus Euler 50's, dB | sharpness | dB to the reference's frames | s a scene |",
-        "|---|---|---|---|---|---|---|---|",
     ]
+    rows: list[list] = []
     for budget in (2, 4, 6, 8, 12, 20):
         for schedule in SCHEDULES:
             fit = [
@@ -334,46 +301,49 @@ def tables(report: Report) -> str:
                 continue
             r = min(fit, key=lambda r: r["metrics"]["latent_error"]["mean"])
             m = r["metrics"]
-            lines.append(
-                f"| {r['evaluations']} | {schedule} | `{r['solver']}`, {r['steps']} | {m['latent_error']['mean']:.4f} | "
-                f"{number(r['psnr_to_euler50'])} | {m['sharpness_ratio']['mean']:.3f} | {m['psnr_reference']['mean']:.1f} | {r['seconds']['median']:.2f} |"
-            )
+            row = [r["evaluations"], schedule, f"`{r['solver']}`, {r['steps']}"]
+            row += [f"{m['latent_error']['mean']:.4f}", number(r["psnr_to_euler50"])]
+            row += [f"{m['sharpness_ratio']['mean']:.3f}", f"{m['psnr_reference']['mean']:.1f}"]
+            rows.append([*row, f"{r['seconds']['median']:.2f}"])
+    columns = [
+        "evaluations",
+        "schedule",
+        "solver, steps",
+        "latent error",
+        "PSNR minus Euler 50's, dB",
+    ]
+    columns += ["sharpness", "dB to the reference's frames", "s a scene"]
+    lines += harness.table(columns, rows)
     solver, schedule, _ = report["verdict"]["default"].split()
     own = [r for r in report["records"] if r["solver"] == solver and r["schedule"] == schedule]
+    columns = ["evaluations", "latent error to the reference", "PSNR, dB", "sharpness"]
+    columns += ["PSNR of gradients, dB", "agreement of frames, dB", "s a scene"]
+    rows = []
+    for r in sorted(own, key=lambda r: r["evaluations"]):
+        v = r["metrics"]
+        row = [r["evaluations"], f"{v['latent_error']['mean']:.3f}", number(v["psnr"])]
+        row += [f"{v['sharpness_ratio']['mean']:.3f}", f"{v['gradient_psnr']['mean']:.2f}"]
+        rows.append([*row, f"{v['consistency']['mean']:.1f}", f"{r['seconds']['median']:.2f}"])
     lines += [
         "",
         f"`{solver}`, `{schedule}`, against the truth:",
         "",
-        "| evaluations | latent error to the reference | PSNR, dB | sharpness | PSNR of gradients, dB | agreement of frames, dB | s a scene |",
-        "|---|---|---|---|---|---|---|",
+        *harness.table(columns, rows),
     ]
-    for r in sorted(own, key=lambda r: r["evaluations"]):
-        v = r["metrics"]
-        lines.append(
-            f"| {r['evaluations']} | {v['latent_error']['mean']:.3f} | {number(v['psnr'])} | {v['sharpness_ratio']['mean']:.3f} | "
-            f"{v['gradient_psnr']['mean']:.2f} | {v['consistency']['mean']:.1f} | {r['seconds']['median']:.2f} |"
-        )
-    lines += [
-        "",
-        *goals(report["verdict"]),
-        "",
-        "Other knobs, default sampler:",
-        "",
-        "| knob | value | method | PSNR, dB | sharpness | agreement, dB | s a scene |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    lines += ["", *goals(report["verdict"]), "", "Other knobs, default sampler:", ""]
+    columns = ["knob", "value", "method", "PSNR, dB", "sharpness", "agreement, dB", "s a scene"]
+    rows = []
     for r in report["knobs"]:
         if "metrics" not in r:
             continue
         m = r["metrics"]
         seconds = f"{r['seconds']['median']:.2f}" if "seconds" in r else ""
-        lines.append(
-            f"| {r['knob']} | {r['value']} | {r['method']} | {number(m['psnr'])} | {m['sharpness_ratio']['mean']:.3f} | "
-            f"{m['consistency']['mean']:.1f} | {seconds} |"
-        )
+        row = [r["knob"], r["value"], r["method"], number(m["psnr"])]
+        row += [f"{m['sharpness_ratio']['mean']:.3f}", f"{m['consistency']['mean']:.1f}", seconds]
+        rows.append(row)
     for r in report["knobs"]:
         if r["knob"] == "refinement":
-            lines.append(
-                f"| refinement | {r['value']} | {r['method']} | differs by {r['relative_difference_of_features']:.3f} | | | {r['seconds']['median']:.3f} |"
-            )
-    return "\n".join(lines)
+            gap = f"differs by {r['relative_difference_of_features']:.3f}"
+            row = ["refinement", r["value"], r["method"], gap, "", ""]
+            rows.append([*row, f"{r['seconds']['median']:.3f}"])
+    return "\n".join([*lines, *harness.table(columns, rows)])

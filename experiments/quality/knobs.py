@@ -1,6 +1,6 @@
 """The trained model along its other knobs, and its peers along theirs; every point with the default sampler.
 
-Each function returns records {"knob", "value", "method", "metrics", ...}; see `mini_quality.py`.
+Each function returns records {"knob", "value", "method", "metrics", ...}; see `mini.py`.
 """
 
 import dataclasses
@@ -13,6 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.quality.measures import Judge, difference, summary
+from experiments.quality.scenes import (
+    CONTEXTS,
+    DEFAULT_M,
+    Sampler,
+    Scenes,
+    assemble,
+    photos,
+    preparer,
+    timed,
+)
 from roge_jax import config as configs
 from roge_jax import cost, fusion, model, preview
 from roge_jax.config import RoGeConfig
@@ -20,9 +31,6 @@ from roge_jax.core.params import flatten, unflatten
 from roge_jax.metrics import baselines
 from roge_jax.procedural.scenes import sample_sequence
 from roge_jax.video import dit, flow
-
-from .measures import Judge, difference, summary
-from .scenes import CONTEXTS, DEFAULT_M, Sampler, Scenes, assemble, photos, preparer, timed
 
 Record = dict[str, Any]
 PHOTOS = tuple(range(1, CONTEXTS + 1))

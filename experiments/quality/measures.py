@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.quality.scenes import Scenes
 from roge_jax import model
 from roge_jax.config import RoGeConfig
 from roge_jax.metrics import image, report
 from roge_jax.metrics.baselines import bilinear
-
-from .scenes import Scenes
 
 IMAGE = ("psnr", "sharpness_ratio", "gradient_psnr")
 GAP = 4  # frames between the two views that are compared with one another

@@ -6,7 +6,6 @@ of the target slots is the same for every M. Noise comes from (scene, 0) through
 """
 
 import functools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments import harness
 from roge_jax import model
 from roge_jax.config import RoGeConfig
 from roge_jax.data.views import make_sample
@@ -56,10 +56,7 @@ def photos(frames: int, m: int) -> tuple[list[int], list[int]]:
 
 
 def assemble(
-    params: Any,
-    sequences: Sequence[dict[str, np.ndarray]],
-    config: RoGeConfig,
-    m: int = DEFAULT_M,
+    params: Any, sequences: Sequence[dict[str, np.ndarray]], config: RoGeConfig, m: int = DEFAULT_M
 ) -> Scenes:
     """Everything of the rendered `sequences` with m photos each."""
     context, target = photos(config.frames, m)
@@ -107,11 +104,7 @@ def timed(call: Callable[[], Any], parts: int = 1) -> tuple[Any, dict[str, float
     The first call compiles what is new to it and is not counted.
     """
     result = jax.block_until_ready(call())
-    seconds = []
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        jax.block_until_ready(call())
-        seconds.append((time.perf_counter() - began) / parts)
+    seconds = [harness.timed(call).wall / parts for _ in range(REPEATS)]
     middle = float(np.median(seconds))
     return result, {"median": middle, "fastest": min(seconds), "slowest": max(seconds)}
 

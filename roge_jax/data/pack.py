@@ -2,14 +2,15 @@
 
     python -m roge_jax.data.pack SCENE .. --out runs/mine --frames 24 --height 64 --width 112
 
-A scene (any layout of `scenes.readers`) is cut into runs of consecutive views, in the reader's order: a video's frames or
-photos taken while walking. Runs of scenes that have more views than one run overlap by half. Every photo fills the
+A scene (any layout of `scenes.readers`) is cut into runs of consecutive views, in the reader's order or that of their names,
+whichever walk is shorter: a video's frames or photos taken while walking. Runs of scenes that have more views than one run overlap by half. Every photo fills the
 picture and is cropped at the centre, K moves along; poses stay in the scene's own frame and unit, since training
 normalises every sample by itself. Each scene is one shard, written under temporary names; its .npz comes last.
 """
 
 import argparse
 import json
+import re
 import shutil
 import sys
 from collections.abc import Sequence
@@ -22,10 +23,33 @@ from roge_jax.files.entry import execute, number
 from roge_jax.files.folders import put
 from roge_jax.scenes.scene import Scene, load_scene, prepare
 
+SHORTER = 0.8  # a walk by names this much shorter than the file's is the one that was walked
+
 
 def runs(views: int, frames: int) -> list[int]:
     """First views of the runs of `frames` views: half a run apart, the last one ending at the last view."""
     return sorted({*range(0, views - frames, max(1, frames // 2)), views - frames})
+
+
+def walk_order(scene: Scene) -> list[int]:
+    """The views in the order in which the camera walked: the reader's, or that of the names where its way is shorter.
+
+    COLMAP and nerfstudio write photos in the order in which they were registered; the names are those of the walk.
+    """
+    given = list(range(len(scene)))
+    named = sorted(given, key=lambda i: _natural(scene.names[i]))
+
+    def way(order: list[int]) -> float:
+        steps = np.diff(scene.cameras.centres[order], axis=0)
+        return float(np.linalg.norm(steps, axis=-1).sum())
+
+    return named if way(named) < SHORTER * way(given) else given
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    """A name with its numbers as numbers, for sorting."""
+    parts = re.split(r"(\d+)", name)
+    return [(0, int(p), "") if p.isascii() and p.isdecimal() else (1, 0, p) for p in parts]
 
 
 def pack_scene(scene: Scene, stem: Path, *, frames: int, height: int, width: int) -> int:
@@ -38,17 +62,19 @@ def pack_scene(scene: Scene, stem: Path, *, frames: int, height: int, width: int
             f"{scene.source}: has {len(scene)} views, a sequence needs {frames}: add views, or give --frames "
             f"{len(scene)} (at least the model's window, which is 17 for mini)."
         )
-    starts = runs(len(scene), frames)
+    starts, order = runs(len(scene), frames), walk_order(scene)
+    if order != list(range(len(scene))):
+        print(f"note: {scene.source}: views are taken in the order of their names, not of the file")
     part = stem.with_suffix(".rgb.npy.part")
     rgb = np.lib.format.open_memmap(part, "w+", np.uint8, (len(starts), frames, height, width, 3))
     K = np.zeros((len(starts), frames, 3, 3))
     for row, start in enumerate(starts):
-        ids = range(start, start + frames)
+        ids = order[start : start + frames]
         images, cameras = prepare(scene, ids, height, width, drop_duplicates=False)
         rgb[row], K[row] = np.round(images * 255.0), cameras.K
     rgb.flush()
     put(part, part.with_suffix(""))
-    c2w = np.stack([scene.cameras.c2w[start : start + frames] for start in starts])
+    c2w = np.stack([scene.cameras.c2w[order[start : start + frames]] for start in starts])
     part = stem.with_suffix(".npz.part")
     with part.open("wb") as file:
         np.savez(file, seeds=np.arange(len(starts)), K=K, c2w=c2w)

@@ -31,6 +31,18 @@ def check_output(output: Size, size: Size, smallest: int) -> None:
         )
 
 
+def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]]:
+    """(context ids, target ids) of a scene: a centred run of views, contexts in the middle of equal parts of it."""
+    run = min(views, frames + contexts)
+    if run <= contexts:
+        raise UserError(
+            f"{views} views cannot give {contexts} contexts and a target: use fewer with --context."
+        )
+    start = (views - run) // 2
+    context = [start + int((i + 0.5) * run / contexts) for i in range(contexts)]
+    return context, [i for i in range(start, start + run) if i not in context]
+
+
 def open_views(
     name: str,
     views: int,

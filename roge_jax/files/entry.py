@@ -27,6 +27,8 @@ from typing import Any, NoReturn
 
 from ..errors import UserError, did_you_mean
 
+_PACKAGE = __package__.partition(".")[0]
+
 CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
 LESS = "ask for less, e.g. fewer frames or photos or a smaller size (--dry-run tells what a run needs)."
 REMEDIES = {
@@ -72,6 +74,9 @@ def execute(
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in arguments
+    for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot show is escaped
+        with contextlib.suppress(AttributeError, ValueError, OSError):
+            stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)  # sentences for the user
         warnings.showwarning = _one_line
@@ -98,9 +103,30 @@ def execute(
             if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):  # XLA's words
                 first = str(error).splitlines()[0]
                 return _report(UserError(f"Out of memory ({first}): {LESS}"), 1, debug)
+            if (missing := _missing_platform()) is not None:
+                return _report(missing, 2, debug)
             if not isinstance(error, _expected_stops()):
                 raise
             return _report(error, 1, debug)
+        except AssertionError:  # JAX's own, where a platform's plugin finds no device
+            if (missing := _missing_platform()) is None:
+                raise
+            return _report(missing, 2, debug)
+
+
+def _missing_platform() -> UserError | None:
+    """What to say if JAX_PLATFORMS (or its older name) asks for a platform that this machine or installation lacks."""
+    name = next((n for n in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME") if os.environ.get(n)), None)
+    if name is None or "jax" not in sys.modules:
+        return None
+    try:
+        sys.modules["jax"].devices()
+    except (RuntimeError, AssertionError):
+        return UserError(
+            f"{name}={os.environ[name]}: JAX finds no such device here: unset it, or set it to cpu, or install JAX for "
+            "that device."
+        )
+    return None
 
 
 def _system(error: OSError) -> UserError:
@@ -183,7 +209,7 @@ def _expected_stops() -> tuple[type[BaseException], ...]:
         ("video.solve_info", "SamplingError"),
         ("training.loop", "TrainingStopped"),
     ):
-        loaded = sys.modules.get(f"{__package__}.{module}")
+        loaded = sys.modules.get(f"{_PACKAGE}.{module}")
         if loaded is not None:
             found.append(getattr(loaded, name))
     return tuple(found)
@@ -205,18 +231,20 @@ def _one_line(message, category, filename, lineno, file=None, line=None) -> None
 
 
 def cache_folder() -> Path | None:
-    """Where compiled programs are kept: ROGE_CACHE, or the user's cache folder; None if ROGE_CACHE is "off".
+    """Where compiled programs are kept: ROGE_CACHE, or the user's cache folder; None if ROGE_CACHE is "off" or there is no home.
 
     One folder per kind of processor: a program compiled for one may not run on another that shares the disk.
     """
     given = os.environ.get(CACHE_VARIABLE, "")
     if given.lower() in ("off", "0", "no"):
         return None
-    base = (
-        Path(given)
-        if given
-        else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "roge_jax"
-    )
+    try:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
+    except RuntimeError:  # a user without a home and without an entry among the users
+        if not given:
+            return None
+        cache = Path()
+    base = Path(given) if given else cache / "roge_jax"
     return base / f"programs-{_processor()}"
 
 
@@ -337,7 +365,7 @@ def environment() -> dict[str, Any]:
 
 def git_commit(folder: Path | None = None) -> str | None:
     """The commit of the package's own checkout ("-dirty" if tracked files differ), None for an installed package."""
-    folder = folder or Path(__file__).resolve().parent.parent
+    folder = folder or Path(__file__).resolve().parents[2]
     if not (folder / ".git").exists():
         return None
     try:

@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
@@ -90,3 +90,43 @@ def matrix(value: Any, shape: tuple[int, ...], where: str, name: str) -> np.ndar
 def _short(value: Any) -> str:
     text = repr(value).replace("\n", " ")
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def fits(value, hint) -> bool:
+    """Whether a value read from JSON is of the kind that a field's type hint asks for; whole numbers are not negative."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return value in arguments and not isinstance(value, bool)
+    if kind is tuple:
+        return (
+            isinstance(value, tuple)
+            and len(value) > 0
+            and all(fits(x, arguments[0]) for x in value)
+        )
+    if kind is not None:  # a union
+        return any(fits(value, option) for option in arguments)
+    if hint is float:
+        return (
+            isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        )
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, hint)
+
+
+def described(hint) -> str:
+    """What a type hint asks for, in words."""
+    kind, arguments = get_origin(hint), get_args(hint)
+    if kind is Literal:
+        return "one of " + ", ".join(map(str, arguments))
+    if kind is tuple:
+        return f"a list, of each {described(arguments[0])}"
+    if kind is not None:
+        return " or ".join(described(option) for option in arguments)
+    words = {
+        int: "a whole number of at least 0",
+        float: "a number",
+        bool: "true or false",
+        str: "a word",
+    }
+    return words.get(hint, "null")

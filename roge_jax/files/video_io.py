@@ -3,12 +3,14 @@
 Frames are [n, h, w, 3], RGB, uint8 or float in [0, 1].
 """
 
+import errno
 import shutil
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,6 +18,7 @@ from ..errors import UserError
 from .folders import put
 
 FPS = 16  # of Wan2.1
+DISK = (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.ENOENT, errno.EROFS)
 BT709 = 1  # the number of this colour standard in H.264 and in FFmpeg
 
 
@@ -49,39 +52,63 @@ def write_video(
 ) -> Path:
     """Writes H.264 (yuv420p, index in front) that browsers play; returns the file written.
 
-    `quality` is x264's constant rate factor, 0 lossless to 51. Without PyAV it is VP9 in a .webm of the same name,
-    with a warning. Raises: UserError for no frames or another shape.
+    `quality` is x264's constant rate factor, 0 lossless to 51. Where this PyAV has no encoder for H.264 (builds without
+    GPL parts), or none is installed, it is VP9 in a .webm of the same name, and at last an animated .webp, with a
+    warning: a missing codec never costs the frames. Raises: UserError for no frames or another shape.
     """
     path, frames = Path(path), to_uint8(frames)
     if frames.ndim != 4 or frames.shape[-1] != 3 or frames.size == 0:
         raise UserError(f"{path}: a video needs frames [n, h, w, 3], given shape {frames.shape}.")
     if not fps > 0:
         raise UserError(f"{path}: {fps} frames per second: give a number above 0.")
-    frames = even(frames)
-    try:
-        import av  # noqa: F401
-    except ImportError:
-        webm = path.with_suffix(".webm")
-        warnings.warn(
-            f"PyAV is not installed: {webm.name} (VP9) is written instead of {path.name}",
-            stacklevel=2,
-        )
-        with _whole(webm) as temporary:
-            _write_vp9(temporary, frames, fps)
-        return webm
-    with _whole(path) as temporary:
-        _write_h264(temporary, frames, fps, quality)
-    return path
+    frames, reasons = even(frames), []
+    for name, ending, write in _writers():
+        target = path if ending is None else path.with_suffix(ending)
+        try:
+            with _whole(target) as temporary:
+                write(temporary, frames, fps, quality)
+        except OSError as error:  # PyAV's are such, too: those of the disk are no matter of codecs
+            if type(error).__module__ == "builtins" or error.errno in DISK:
+                raise
+            reasons.append(f"{name}: {error}")
+        except (ImportError, UserError, ValueError, RuntimeError) as error:
+            reasons.append(
+                "PyAV is not installed" if isinstance(error, ImportError) else f"{name}: {error}"
+            )
+        else:
+            if reasons:
+                told = f"{target.name} ({name}) is written instead of {path.name}"
+                warnings.warn(f"{reasons[0]}: {told}", stacklevel=2)
+            return target
+    raise UserError(
+        f"{path}: no video could be written ({'; '.join(reasons)}): install PyAV (pip install av)."
+    )
 
 
 def _write_h264(file: Path, frames: np.ndarray, fps: float, quality: int) -> None:
+    _write_av(file, frames, fps, "libx264", {"crf": str(quality), "preset": "medium"})
+
+
+def _write_av_vp9(file: Path, frames: np.ndarray, fps: float, quality: int) -> None:
+    _write_av(file, frames, fps, "libvpx-vp9", {"crf": str(quality), "b": "0"})
+
+
+def _write_webp(file: Path, frames: np.ndarray, fps: float, quality: int) -> None:
+    write_webp(file, frames, fps)
+
+
+def _write_av(
+    file: Path, frames: np.ndarray, fps: float, codec: str, options: dict[str, str]
+) -> None:
+    """One encoder of PyAV's. Raises: what PyAV raises, an OSError or ValueError, if it lacks the codec or the codec refuses."""
     import av
 
-    with av.open(str(file), "w", format="mp4", options={"movflags": "+faststart"}) as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001))
+    form, more = ("mp4", {"movflags": "+faststart"}) if file.suffix == ".mp4" else ("webm", {})
+    with av.open(str(file), "w", format=form, options=more) as container:
+        stream: Any = container.add_stream(codec, rate=Fraction(fps).limit_denominator(1001))
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": str(quality), "preset": "medium"}
+        stream.options = options
         context = stream.codec_context
         # Untagged colours are guessed from the size, and differently by every player.
         context.color_primaries = context.color_trc = context.colorspace = BT709
@@ -94,7 +121,7 @@ def _write_h264(file: Path, frames: np.ndarray, fps: float, quality: int) -> Non
         container.mux(stream.encode())
 
 
-def _write_vp9(file: Path, frames: np.ndarray, fps: float) -> None:
+def _write_vp9(file: Path, frames: np.ndarray, fps: float, quality: int) -> None:
     import cv2
 
     h, w = frames.shape[1:3]
@@ -106,6 +133,16 @@ def _write_vp9(file: Path, frames: np.ndarray, fps: float) -> None:
     for pixels in frames:
         writer.write(np.ascontiguousarray(pixels[..., ::-1]))
     writer.release()
+
+
+def _writers() -> list[tuple[str, str | None, Callable[[Path, np.ndarray, float, int], None]]]:
+    """What is tried, in order: (name, ending or None for the given one, writer)."""
+    return [
+        ("H.264", None, _write_h264),
+        ("VP9", ".webm", _write_av_vp9),
+        ("VP9", ".webm", _write_vp9),
+        ("WebP", ".webp", _write_webp),
+    ]
 
 
 def read_video(path: str | Path) -> np.ndarray:

@@ -366,11 +366,12 @@ def inspect(
     height: int | Sequence[int],
     width: int | Sequence[int],
     names: Sequence[str] | None = None,
+    read_as: str = "",
 ) -> tuple[Cameras, list[Finding]]:
     """All that is wrong with cameras, without raising: (cameras mended where safe, findings)."""
     names = names or [f"{view}" for view in range(len(cameras.c2w))]
     K, c2w, findings = inspect_arrays(
-        np.asarray(cameras.K), np.asarray(cameras.c2w), height, width, names
+        np.asarray(cameras.K), np.asarray(cameras.c2w), height, width, names, read_as
     )
     return Cameras(K, c2w), findings
 
@@ -380,16 +381,17 @@ def validate(
     height: int | Sequence[int],
     width: int | Sequence[int],
     names: Sequence[str] | None = None,
+    read_as: str = "",
 ) -> Cameras:
     """The cameras in float64 if they can be used; slight skew is mended with a CameraWarning.
 
     Args: K in pixels of images of `height` x `width` (one number, or one per view); `names` for
-      messages.
+      messages; `read_as` the convention that the poses were read in, if the user may choose another.
     Raises: UserError naming the view and the field: NaN, mirrored, scaled or sheared rotation,
       wrong last row, focal length that is no focal length in pixels, principal point outside the
       picture.
     """
-    cameras, findings = inspect(cameras, height, width, names)
+    cameras, findings = inspect(cameras, height, width, names, read_as)
     errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
         more = f" {len(errors) - 1} more: run python -m roge_jax.check." if len(errors) > 1 else ""

@@ -120,7 +120,7 @@ def inspect_intrinsics(K: np.ndarray, height: int, width: int, where: str) -> li
     vertical = np.degrees(np.arctan(cy / fy) + np.arctan((height - cy) / fy))
     if max(horizontal, vertical) > WIDE_FOV:
         what = f"field of view {horizontal:.0f} x {vertical:.0f} degrees"
-        fix = "a fisheye needs its distortion coefficients; check them"
+        fix = "so wide a view has no flat picture without loss: crop it, or choose a narrower lens"
         findings.append(found("warning", what, fix))
     if not 0.5 < fx / fy < 2:
         what = f"fx / fy = {fx / fy:.3g}"
@@ -140,6 +140,7 @@ def inspect_arrays(
     height: int | Sequence[int],
     width: int | Sequence[int],
     names: Sequence[str],
+    read_as: str = "",
 ) -> tuple[np.ndarray, np.ndarray, list[Finding]]:
     """All views, K [v, 3, 3] and c2w [v, 4, 4] or [v, 3, 4]: in float64, mended where safe."""
     if len(K) != len(c2w):
@@ -167,7 +168,7 @@ def inspect_arrays(
         )
     if not any(f.severity == "error" for f in findings):
         c2w = np.stack(poses) if poses else np.zeros((0, 4, 4))
-        findings += inspect_axes(c2w)
+        findings += inspect_axes(c2w, read_as)
     return np.asarray(K, np.float64), np.asarray(c2w, np.float64), findings
 
 
@@ -197,14 +198,22 @@ def axes_votes(c2w: np.ndarray) -> tuple[int, int]:
     return front, behind
 
 
-def inspect_axes(c2w: np.ndarray) -> list[Finding]:
-    """A warning if the cameras seem to look away from what they should share (see `axes_votes`)."""
+def inspect_axes(c2w: np.ndarray, read_as: str = "") -> list[Finding]:
+    """A warning if the cameras seem to look away from what they should share (see `axes_votes`).
+
+    read_as: the convention that they were read in, if the user may choose another.
+    """
     c2w = c2w[:: max(1, len(c2w) // 40)]
     front, behind = axes_votes(c2w)
     if behind < 2 or behind < 4 * front:
         return []
     what = f"the optical axes meet behind the cameras in {behind} of {front + behind} pairs"
-    fix = "unless it is an outward panorama, its axes may be OpenGL: try convention='opengl'"
+    other = "opencv" if read_as.startswith("opengl") else "opengl"
+    name = {"opencv": "OpenCV", "opengl": "OpenGL"}[other]
+    read = f", not '{read_as}' as they were read" if read_as else ""
+    fix = (
+        f"unless it is an outward panorama, its axes may be {name}{read}: try convention='{other}'"
+    )
     return [Finding("warning", "cameras", what, fix)]
 
 

@@ -16,7 +16,8 @@ from ..config import RoGeConfig
 from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling.choices import Choices, around
-from ..sampling.video import Photos, Settings
+from ..sampling.photos import Photos
+from ..sampling.video import Settings
 from ..sampling.windows import chained, windows
 from ..scenes import coverage
 from ..video import flow, solvers

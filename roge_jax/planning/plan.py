@@ -22,7 +22,8 @@ from ..core.params import Tree
 from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling.choices import Choices
-from ..sampling.video import Photos, Settings, read_photos
+from ..sampling.photos import Photos, read_photos
+from ..sampling.video import Settings
 from ..scenes import coverage
 from ..scenes.scene import Scene
 from . import proxies

@@ -21,7 +21,8 @@ from ..geometry.cameras import Cameras, normalise
 from ..recon.ray_scene import merge_scene
 from ..recon.vggt import encoder_grid
 from ..sampling import programs
-from ..sampling.video import Photos, Settings
+from ..sampling.photos import Photos
+from ..sampling.video import Settings
 from ..sampling.windows import window_noise, window_views
 from ..video import flow, solvers
 
@@ -123,7 +124,7 @@ def _predict(params, batch, *, config: RoGeConfig):
 
     def one(views):
         tokens = model.reconstruct(params, views, config=config)
-        picture = programs.rgb_head(params, views, config=config, scene_tokens=tokens)
+        picture, _ = programs.rgb_head(params, views, config=config, scene_tokens=tokens)
         cell = jnp.square(tokens).mean() - jnp.square(merge_scene(tokens, None, grid, 4)[0]).mean()
         return picture[0], cell / jnp.square(tokens).mean()
 

@@ -1,6 +1,6 @@
 """The measured constants that turn a knob into a predicted error: `assets/planning.json`.
 
-`experiments/plan_ladder.py --calibrate` measures them on procedural training scenes, one knob turned at a time, and
+`python -m experiments.planning.ladder --calibrate` measures them on procedural training scenes, one knob turned at a time, and
 writes them with what produced them. Models without an entry get those of `mini` and say so.
 """
 
@@ -113,7 +113,7 @@ def load(name: str) -> Table:
     """The table of a model, by the name of its configuration; that of `mini` for models without one."""
     if not FILE.exists():
         raise UserError(
-            f"{FILE}: the planner's constants are missing: run experiments/plan_ladder.py --calibrate."
+            f"{FILE}: the planner's constants are missing: run python -m experiments.planning.ladder --calibrate."
         )
     tables = json.loads(FILE.read_text())
     name = name if name in tables else DEFAULT

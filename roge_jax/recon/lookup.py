@@ -30,6 +30,8 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
+from .aggregate import settled, with_structure
+from .rendering import Blend, render
 from .sweep import (
     EPS,
     SHARED,
@@ -56,6 +58,14 @@ UNKNOWN = 0.3  # deviation of colours that no two photos show
 UNSEEN = -8.0  # logit of cuts that no photo sees
 
 
+class Full(NamedTuple):
+    """Photos finer than the model's, and the size of the picture that is wanted of them."""
+
+    photos: jax.Array  # [m, ., ., 3] in [0, 1]; they show what the photos at the model's size show
+    height: int
+    width: int
+
+
 class Looked(NamedTuple):
     """What rays found in the photos."""
 
@@ -63,6 +73,9 @@ class Looked(NamedTuple):
     head: jax.Array  # [v, h, w, 3] the RGB head's
     photos: jax.Array  # [v, h, w, 3] its part from the photos alone
     coarse: jax.Array  # [v, h / 4, w / 4, 3] the photos' colours under the coarse distribution
+    full: jax.Array | None = (
+        None  # [v, height, width, 3] the picture at another size, see `recon.rendering`
+    )
 
 
 def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
@@ -119,10 +132,12 @@ def look_up(
     photo_cameras: tuple[jax.Array, jax.Array],
     *,
     cuts: int,
+    full: Full | None = None,
 ) -> Looked:
     """Ray features [v, gh, gw, d] and the RGB head's picture of them [v, h, w, 3] -> `Looked`.
 
-    photos [m, h, w, 3] in [0, 1]; cameras (K, c2w) of the v views and of the m photos, in the normalised frame.
+    photos [m, h, w, 3] in [0, 1]; cameras (K, c2w) of the v views and of the m photos, in the normalised frame. With
+    `full` also the picture at its size; no gradient passes through that.
     """
     v, gh, gw, d = features.shape
     ch = photos.shape[1] // CELL
@@ -134,28 +149,51 @@ def look_up(
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
     alike = twins(photo_cameras[1])
+    structured = None if full is None else with_structure(photos)
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
         reach = shared_reach(way, alike, maps.shape[1:3], CELL, cuts)
         around = _agreement_around(halves, alike, way, reach, cuts)
-        coarse, cut, sure, hidden = _coarse(
+        belief, coarse, cut, sure, hidden = _coarse(
             p, maps, alike, way, reach, prior, context, _cells(head[None])[0], around
         )
         weights = linear(p["upsample"], jnp.concatenate([hidden, context], -1))
         cut, sure = (_upsampled(weights, x) for x in (cut, sure))
+
+        def choose(cut, found, seen):
+            apart, chord = (x[:, None, None, None] for x in far)
+            away = apart * inverse_depth(cut, cuts, reach)[None, ..., None] + chord
+            looked, some, scene, share = _chosen(p["choose"], found, seen, alike, away, head)
+            about = jnp.concatenate([scene, sure[..., None]], -1)
+            return looked, share, _merged(p["merge"], head, looked, some, about)
+
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
-        apart, chord = (x[:, None, None, None] for x in far)
-        far = apart * inverse_depth(cut, cuts, reach)[None, ..., None] + chord
-        looked, some, scene = _chosen(p["choose"], found, seen, alike, far, head)
-        about = jnp.concatenate([scene, sure[..., None]], -1)
-        return Looked(_merged(p["merge"], head, looked, some, about), head, looked, coarse)
+        looked, _, (mixed, _, _) = choose(cut, found, seen)
+        own = Looked(mixed, head, looked, coarse)
+        if structured is None:
+            return own, None
+        _, h, w, _ = photos.shape
+        where = pixels_of(h, w, 1)
+        values, seen = fetch(structured, way, where, all_cuts(cuts, h * w, reach))
+        cut = settled(values, seen, alike, belief, h, w)
+        inverse = inverse_depth(cut.reshape(1, -1), cuts, reach)
+        found, seen = (
+            x.reshape(-1, h, w, x.size // (len(x) * h * w))
+            for x in fetch(photos, way, where, inverse)
+        )
+        _, share, (_, gate, rest) = choose(cut, found, seen)
+        return own, Blend(cut, reach, share, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.
-    if jax.default_backend() == "cpu" and ways("seq") == 1:
-        return jax.lax.map(lambda view: one(*view), views)
-    return jax.vmap(one)(*views)
+    alone = jax.default_backend() == "cpu" and ways("seq") == 1
+    looked, blend = jax.lax.map(lambda view: one(*view), views) if alone else jax.vmap(one)(*views)
+    if full is None:
+        return looked
+    scale = photo_cameras[0][None, :, 0, 0] / cameras[0][:, None, 0, 0]
+    size = {"height": full.height, "width": full.width}
+    return looked._replace(full=render(full.photos, way, blend, scale, cuts=cuts, **size))
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:
@@ -205,8 +243,8 @@ def _coarse(p: Tree, maps, alike, way: Motion, reach, prior, context, head, arou
     """One view's distribution over the cuts of a cell, from prior [ch, cw, k], context [ch, cw, c] and the agreement of
     colours around it [k, ch, cw, 5].
 
-    Returns the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there [ch, cw], and the hidden
-    state [ch, cw, c].
+    Returns its logits [k, ch, cw], the photos' mean colour under it [ch, cw, 3], the cut at its peak, the mass there
+    [ch, cw], and the hidden state [ch, cw, c].
     """
     ch, cw, cuts = prior.shape
     numbers = jnp.arange(cuts, dtype=jnp.float32)
@@ -242,7 +280,7 @@ def _coarse(p: Tree, maps, alike, way: Motion, reach, prior, context, head, arou
     about = share * (jnp.abs(numbers[:, None, None] - peak[None]) <= 2)
     mass = about.sum(0)
     cut = (about * numbers[:, None, None]).sum(0) / mass
-    return colours, cut, mass, (share[..., None] * y).sum(0)
+    return logits, colours, cut, mass, (share[..., None] * y).sum(0)
 
 
 def _fine(p: Tree, photos, alike, cuts: int, way: Motion, reach, cut, head):
@@ -290,7 +328,7 @@ def _distances(c2w, photo_c2w) -> tuple[jax.Array, jax.Array]:
 
 def _chosen(p: Tree, found, seen, alike, far, head):
     """The photos' colours [m, h, w, 3] weighed, from how much of them is seen and how far they are [m, h, w, 1]: (colour
-    [h, w, 3], how much of it is seen [h, w, 1], two numbers per pixel about the choice [h, w, 2]).
+    [h, w, 3], how much of it is seen [h, w, 1], two numbers per pixel about the choice [h, w, 2], the weights [m, h, w, 1]).
 
     The choice starts from 1 / distance^2 among photos that see the cut.
     """
@@ -308,16 +346,17 @@ def _chosen(p: Tree, found, seen, alike, far, head):
     looked = (share * found).sum(0)
     spread = (share * jnp.square(found - looked[None])).sum(0).mean(-1, keepdims=True)
     about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(0)], -1)
-    return looked, (share * seen).sum(0), about
+    return looked, (share * seen).sum(0), about, share
 
 
-def _merged(p: Tree, head, looked, some, about) -> jax.Array:
-    """The RGB head's picture of a view and the photos' colours, mixed and corrected."""
+def _merged(p: Tree, head, looked, some, about) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The RGB head's picture of a view and the photos' colours, mixed and corrected: (the mixture [h, w, 3], the photos'
+    part in it [h, w, 1], the correction [h, w, 3])."""
     change = looked - head
     odd = jnp.abs(change).mean(-1, keepdims=True)
     y = jnp.concatenate([head - 0.5, looked - 0.5, change, odd, some, about], -1)
     y = jax.nn.relu(conv2d(p["conv1"], y[None]))
     y = y + jax.nn.relu(conv2d(p["conv2"], y))
     y = conv2d(p["conv3"], y)[0]
-    mixed = head + jax.nn.sigmoid(y[..., :1]) * some * change + y[..., 1:]
-    return jnp.clip(mixed, 0.0, 1.0)
+    gate, rest = jax.nn.sigmoid(y[..., :1]) * some, y[..., 1:]
+    return jnp.clip(head + gate * change + rest, 0.0, 1.0), gate, rest

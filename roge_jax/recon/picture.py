@@ -50,15 +50,33 @@ def decode_rgb(
 
 def show(params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Array:
     """`decode_rgb` of the targets alone [n, recon_height, recon_width, 3], from the ray features of all views."""
-    m = views["context_rgb"].shape[0]
-    return decode_rgb(params, features[m:], only_targets(views), config=config, context=views)
+    return show_all(params, features, views, config=config)[0]
+
+
+def show_all(
+    params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig, full: bool = False
+) -> tuple[jax.Array, jax.Array | None]:
+    """`show`, and with `full` the same at the output's size [n, H, W, 3] where there is one (`decode_all`)."""
+    m, targets = views["context_rgb"].shape[0], only_targets(views)
+    shown = decode_all(params, features[m:], targets, config=config, context=views, full=full)
+    return shown.rgb, shown.full
 
 
 def decode_all(
-    params: Tree, features: jax.Array, views: Views, *, config: RoGeConfig, context: Views
+    params: Tree,
+    features: jax.Array,
+    views: Views,
+    *,
+    config: RoGeConfig,
+    context: Views,
+    full: bool = False,
 ) -> lookup.Looked:
-    """`decode_rgb` with the parts it is made of, which training looks at too; without look-up all are the RGB head's."""
+    """`decode_rgb` with the parts it is made of, which training looks at too; without look-up all are the RGB head's.
+
+    `full`: also the picture at the output's size, if `context` has the photos for it (`context_full`).
+    """
     cfg = config.renderer
+    finer = context.get("context_full") if full else None
     head = ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=cfg)
     if not cfg.lookup:
         return lookup.Looked(head, head, head, head)
@@ -72,4 +90,5 @@ def decode_all(
         recon_cameras(views, config),
         (K[: len(photos)], c2w[: len(photos)]),
         cuts=cfg.lookup,
+        full=None if finer is None else lookup.Full(finer, *config.output_size),
     )

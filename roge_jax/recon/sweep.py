@@ -72,6 +72,12 @@ def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, in
     `way`: the view's motion in pixels of the images; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. A cut is
     seen (1, else 0) if it lies in front of the photo and inside its frame.
     """
+    x, y, _, seen = meet_at(way, pixels, inverse, size)
+    return x, y, seen
+
+
+def meet_at(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, int]):
+    """`meet` with how deep a cut lies in the photos: (x, y, depth there / depth in the view, seen)."""
     h, w = size
     ones = jnp.ones((len(pixels), 1))
     start = jnp.einsum("mij,pj->mpi", way.turn, jnp.concatenate([pixels, ones], -1))
@@ -80,7 +86,7 @@ def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, in
     z = jnp.where(front, q[..., 2], 1.0)
     x, y = (jnp.where(front, q[..., i] / z, -1.0) for i in (0, 1))
     seen = front & (x >= 0) & (y >= 0) & (x <= w) & (y <= h)
-    return x, y, seen.astype(jnp.float32)
+    return x, y, z, seen.astype(jnp.float32)
 
 
 def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
@@ -90,17 +96,29 @@ def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array)
     """
     m, h, w, _ = images.shape
     x, y, seen = meet(way, pixels, inverse, (h, w))
+    first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
+    return bilinear(texels(images), x, y, (h, w), first[:, None, None]), seen
+
+
+def texels(images: jax.Array) -> jax.Array:
+    """Images [m, h, w, c] -> rows [m (h - 1) (w - 1), 4 c] that hold the four neighbours of a sample: one gather instead of
+    four."""
+    m, h, w, c = images.shape
+    corners = [images[:, i : h - 1 + i, j : w - 1 + j] for i in (0, 1) for j in (0, 1)]
+    return jnp.concatenate(corners, -1).reshape(m * (h - 1) * (w - 1), 4 * c)
+
+
+def bilinear(rows: jax.Array, x, y, size, first) -> jax.Array:
+    """Values [.., c] at (x, y) in pixels of images of `size` (h, w), whose `texels` begin at row `first`; border
+    repeated. Sizes and first rows may differ from sample to sample."""
+    h, w = size
     x, y = jnp.clip(x - 0.5, 0.0, w - 1.001), jnp.clip(y - 0.5, 0.0, h - 1.001)
     left, top = jnp.floor(x), jnp.floor(y)
     fx, fy = (x - left)[..., None], (y - top)[..., None]
-    # A row holds the four neighbours of a sample: one gather instead of four.
-    corners = [images[:, i : h - 1 + i, j : w - 1 + j] for i in (0, 1) for j in (0, 1)]
-    quads = jnp.concatenate(corners, -1).reshape(m * (h - 1) * (w - 1), -1)
-    first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
-    index = (top * (w - 1) + left).astype(jnp.int32) + first[:, None, None]
-    a, b, c, d = jnp.split(quads.at[index].get(mode="promise_in_bounds"), 4, -1)
+    index = (top * (w - 1) + left).astype(jnp.int32) + first
+    a, b, c, d = jnp.split(rows.at[index].get(mode="promise_in_bounds"), 4, -1)
     upper, lower = a + fx * (b - a), c + fx * (d - c)
-    return upper + fy * (lower - upper), seen
+    return upper + fy * (lower - upper)
 
 
 def twins(photo_c2w: jax.Array) -> jax.Array:
@@ -131,13 +149,15 @@ def agreement(values: jax.Array, weight: jax.Array):
     return mean, jnp.sqrt(jnp.where(n > 1.5, variance, STRANGE) + 1e-4), n
 
 
-def pixels_of(h: int, w: int, step: int) -> jax.Array:
-    """Centres [h * w, 2] = (x, y) of cells of `step` pixels."""
-    y, x = np.mgrid[:h, :w] * step + 0.5 * step
-    return jnp.asarray(np.stack([x, y], -1).reshape(-1, 2), jnp.float32)
+def pixels_of(h: int, w: int, step: float | tuple[float, float]) -> jax.Array:
+    """Centres [h * w, 2] = (x, y) of cells of `step` pixels (down, across)."""
+    down, across = step if isinstance(step, tuple) else (step, step)
+    y, x = np.mgrid[:h, :w] + 0.5
+    return jnp.asarray(np.stack([across * x, down * y], -1).reshape(-1, 2), jnp.float32)
 
 
-def in_pixels_of(way: Motion, side: int) -> Motion:
-    """`way` in pixels of images that are `side` times smaller."""
-    shrink = jnp.asarray([1 / side, 1 / side, 1.0])
+def in_pixels_of(way: Motion, side: float | tuple[float, float]) -> Motion:
+    """`way` in pixels of images that are `side` times smaller (down, across)."""
+    down, across = side if isinstance(side, tuple) else (side, side)
+    shrink = jnp.asarray([1 / across, 1 / down, 1.0])
     return Motion(shrink[None, :, None] * way.turn, shrink[None] * way.shift)

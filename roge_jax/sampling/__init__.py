@@ -5,15 +5,12 @@ from ..core.lazy import submodules
 __getattr__, __dir__ = submodules(
     __name__,
     choices=("Choices", "Planned"),
+    photos=("Photos", "blank_scene", "context_ids", "read_photos"),
     video=(
-        "Photos",
         "Result",
         "Settings",
-        "blank_scene",
-        "context_ids",
         "integrate",
         "noise_levels",
-        "read_photos",
         "reduced",
         "sample",
     ),

@@ -2,7 +2,7 @@
 
 Everything that can be seen before sampling is measured here, without the network: how far targets leave the photos,
 how much wider or narrower they see, how many photos differ at all, how unlike their exposures are, how blurred and how
-noisy they are. The limits are not chosen: `experiments/robustness.py` disturbs held-out scenes, finds by interpolation
+noisy they are. The limits are not chosen: `experiments/stability/robustness.py` disturbs held-out scenes, finds by interpolation
 where the model's output has lost 1 dB, and writes `assets/limits.json` with what produced it. What a photo shows moves
 the last three as well, so their limits lie no further in than where 95 % of the undisturbed scenes are. Models without
 an entry (by the name of their configuration) get no warnings. docs/robustness.md shows the curves.
@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import LimitWarning
 from ..geometry.cameras import Cameras, to_host
 
-TABLE = Path(__file__).with_name("assets") / "limits.json"
+TABLE = Path(__file__).parents[1] / "assets" / "limits.json"
 SAME_PLACE, SAME_ANGLE = 0.01, 1.0  # of the baseline, degrees: photos closer than both are one
 LUMA = (0.299, 0.587, 0.114)
 GAMMA = 2.2

@@ -15,6 +15,7 @@ from .. import model
 from ..config import RoGeConfig
 from ..core import sharding
 from ..core.params import Tree
+from ..recon.picture import decode_all
 from ..video import flow
 
 
@@ -43,7 +44,7 @@ def velocity(
 
 def prepare_stretch(
     params: Tree, views: model.Views, rest: model.Views, *, config: RoGeConfig
-) -> tuple[model.Prepared, jax.Array]:
+) -> tuple[model.Prepared, tuple[jax.Array, jax.Array | None]]:
     """(`model.prepare` of a stretch of a window, `rgb_head` of the targets of `rest`): the photos, the same in both, are
     reconstructed once."""
     tokens = model.reconstruct(params, views, config=config)
@@ -100,21 +101,23 @@ def for_window(
 class PreviewProgram(NamedTuple):
     """What runs in a window that is not generated."""
 
-    preview: Callable  # (params, views) -> [n, recon_h, recon_w, 3]
+    preview: Callable  # (params, views) -> `rgb_head`
 
 
 def rgb_head(
     params: Tree, views: model.Views, *, config: RoGeConfig, scene_tokens: jax.Array | None = None
-) -> jax.Array:
-    """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3]; the photos' rays are not queried."""
+) -> tuple[jax.Array, jax.Array | None]:
+    """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3], and at the output's size [n, H, W, 3]
+    where `views` have `context_full`; the photos' rays are not queried."""
     tokens = scene_tokens
     tokens = model.reconstruct(params, views, config=config) if tokens is None else tokens
     if config.renderer.refinement == "shared":  # its refinement reads the rays of the photos
         features = model.query_rays(params, tokens, views, config=config)
-        return model.show(params, features, views, config=config)
+        return model.show_all(params, features, views, config=config, full=True)
     targets = model.only_targets(views)
     features = model.query_rays(params, tokens, targets, config=config, context=views)
-    return model.decode_rgb(params, features, targets, config=config, context=views)
+    shown = decode_all(params, features, targets, config=config, context=views, full=True)
+    return shown.rgb, shown.full
 
 
 def for_preview(

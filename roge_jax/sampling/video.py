@@ -14,7 +14,7 @@ one length, to the RGB head: for both kinds of window that is one compilation mo
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, NamedTuple
 
@@ -29,13 +29,11 @@ from ..core.params import Tree
 from ..errors import UserError, did_you_mean
 from ..files import fields
 from ..geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
-from ..scenes.coverage import see_path
-from ..scenes.overlap import select_overlapping
-from ..scenes.scene import Scene, distinct_views, select_context
-from ..scenes.scene import prepare as prepare_photos
+from ..geometry.crops import scale_K
 from ..video import flow, solvers
 from . import limits, programs
 from .choices import Choices, Planned, around, spans
+from .photos import Photos
 from .windows import (
     chain_views,
     chained,
@@ -46,7 +44,6 @@ from .windows import (
     woven,
 )
 
-DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
 LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
@@ -90,18 +87,10 @@ class Settings:
         )
 
 
-class Photos(NamedTuple):
-    """Context photos at generation size and, where it differs, at reconstruction size; cameras in the scene's frame."""
-
-    images: np.ndarray  # [m, h, w, 3] float32 in [0, 1]
-    recon: np.ndarray | None  # [m, recon_h, recon_w, 3]
-    cameras: Cameras  # K in pixels of `images`
-    ids: tuple[int, ...]  # views of the scene
-
-
 @dataclasses.dataclass(frozen=True)
 class Result:
-    """frames [n, h, w, 3] and preview [n, recon_h, recon_w, 3] float32 in [0, 1]; cameras [n] in the scene's frame."""
+    """frames and preview [n, H, W, 3] float32 in [0, 1] at the output's size; cameras [n] in the scene's frame, K in
+    pixels of the frames. A model without output of its own shows its preview at the reconstruction's size."""
 
     frames: np.ndarray
     preview: np.ndarray
@@ -112,83 +101,6 @@ class Result:
     # {"rgb_head": [[first, last], ...]}, the frames that are not generated
     windows: tuple[dict[str, Any], ...]
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
-
-
-def context_ids(
-    text: str | None, scene: Scene, config: RoGeConfig, path: Cameras | None = None
-) -> list[int]:
-    """The views that --context asks for: how many, or which by number or name; without a word, up to 6.
-
-    Those that it leaves open are chosen for the `path` where that is known before (K in pixels of the model's size).
-    """
-    most = config.max_context
-    if text is None:
-        return _chosen(scene, min(len(scene), most, DEFAULT_CONTEXT), config, path)
-    words = [word.strip() for word in text.split(",")]
-    if any(words) and ("," in text or text in scene.names):
-        return [_view(word, scene) for word in words if word]
-    if not text.isdecimal() or not 1 <= int(text) <= min(len(scene), most):
-        raise UserError(
-            f"--context {text}: give 1 to {min(len(scene), most)} (the scene has {len(scene)} photos, the "
-            f"model takes {most}), or photos by number or name, separated by commas."
-        )
-    return _chosen(scene, int(text), config, path)
-
-
-def _chosen(scene: Scene, count: int, config: RoGeConfig, path: Cameras | None) -> list[int]:
-    """So many photos of a scene: those that see most of the path, or that hang together; all where there are no more."""
-    if path is not None and count < len(scene):
-        return see_path(scene, path, count, config.height, config.width)
-    if count in (1, len(scene)):
-        return select_context(scene, count)
-    return select_overlapping(scene, count, config.height, config.width)
-
-
-def _view(word: str, scene: Scene) -> int:
-    if word in scene.names:
-        return scene.names.index(word)
-    if word.isdecimal() and int(word) < len(scene):
-        return int(word)
-    if word.isdecimal():
-        raise UserError(
-            f"--context: there is no photo {word}: {scene.source} has {len(scene)}, from 0."
-        )
-    raise UserError(
-        f"--context: {scene.source} has no photo '{word}': {did_you_mean(word, scene.names)}"
-    )
-
-
-def read_photos(scene: Scene, ids: Sequence[int], config: RoGeConfig) -> Photos:
-    """The photos `ids` of a scene, the first one being the world frame. Duplicates are dropped with a warning."""
-    ids = list(ids)
-    images, cameras = prepare_photos(scene, ids, config.height, config.width, drop_duplicates=False)
-    kept = distinct_views(images, cameras)
-    if len(kept) < len(ids):
-        prepare_photos(scene, ids, config.height, config.width)  # says which
-    ids = [ids[i] for i in kept]
-    if len(ids) > config.max_context:
-        raise UserError(
-            f"{len(ids)} context photos: this model ({config.name}) takes 1 to {config.max_context}."
-        )
-    recon = None
-    size = (config.recon_height, config.recon_width)
-    same_shape = config.recon_height * config.width == config.recon_width * config.height
-    if (
-        size != (config.height, config.width) and same_shape
-    ):  # sharper than a resize of the smaller crop
-        recon, _ = prepare_photos(scene, ids, *size, drop_duplicates=False)
-    return Photos(images[kept], recon, cameras[kept], tuple(ids))
-
-
-def blank_scene(source: str, views: int, config: RoGeConfig) -> Scene:
-    """Black photos of the model's size from cameras side by side: what a run costs does not depend on more."""
-    w, h = config.width, config.height
-    K = np.array([[w, 0.0, w / 2], [0.0, w, h / 2], [0.0, 0.0, 1.0]])
-    c2w = np.tile(np.eye(4), (views, 1, 1))
-    c2w[:, 0, 3] = 0.1 * np.arange(views)
-    images = [np.zeros((h, w, 3), np.uint8)] * views
-    names = tuple(f"{i:04d}" for i in range(views))
-    return Scene(images, Cameras(np.tile(K, (views, 1, 1)), c2w), names, source)
 
 
 def _check_photos(photos: Photos, config: RoGeConfig) -> None:
@@ -208,10 +120,7 @@ def reduced(
 ) -> tuple[Photos, RoGeConfig, Settings]:
     """What `sample` runs with under `choices`; equal to what it was given if they are the full model's."""
     if len(choices.photos) < len(photos.ids):
-        kept = list(choices.photos)
-        recon = None if photos.recon is None else photos.recon[kept]
-        ids = tuple(photos.ids[i] for i in kept)
-        photos = Photos(photos.images[kept], recon, photos.cameras[kept], ids)
+        photos = photos.keep(choices.photos)
     size = (config.recon_height, config.recon_width)
     if choices.recon != size:
         recon = photos.images if photos.recon is None else photos.recon
@@ -292,7 +201,8 @@ def sample(
     for number, (window, stretch) in enumerate(zip(runs, made, strict=True)):
         (start, stop), (first, last) = window, stretch
         later = number > 0 and settings.long == "chain"
-        seen = _Seen(photos.images, photos.recon, context, list(range(len(context))), [])
+        own = (photos.images, photos.recon, photos.full)
+        seen = _Seen(*own, context, list(range(len(context))), [])
         if later:
             seen = _seen_later(seen, target, frames, window, config)
         m, rest = len(seen.cameras), around(window, stretch)
@@ -306,7 +216,15 @@ def sample(
         )
         if rest:
             told[-1]["rgb_head"] = [[a, b - 1] for a, b in rest]
-        see = functools.partial(window_views, *seen[:3], info=info, config=config)
+        see = functools.partial(
+            window_views,
+            seen.images,
+            seen.recon,
+            seen.cameras,
+            info=info,
+            config=config,
+            full=seen.full,
+        )
         if first == last:
             part, views = config, [see(target[start:stop])]
         else:
@@ -324,8 +242,9 @@ def sample(
         run = cache[key]
         if first == last:
             with stage("preview"):
-                previews.append(np.array(run.preview(params, *views))[: len(shown)])
-            frames.append(_enlarged(previews[-1], photos.images))
+                frame, preview = _shown(run.preview(params, *views), len(shown), config)
+            frames.append(frame)
+            previews.append(preview)
             continue
         bar.set_description("sampling")
         # With fewer photos than given, the targets keep the noise that they have with all of them.
@@ -339,19 +258,21 @@ def sample(
         with stage("sample"):
             x0, count = integrate(run, params, prepared, noise, grid, settings, part, bar)
         with stage("decode"):
-            # Copies: on a CPU a view would keep the device's array alive.
-            frames.append(np.array(run.decode(params, x0, prepared.detail))[: last - first])
-            previews.append(np.array(prepared.shown)[: last - first])
+            video = np.asarray(run.decode(params, x0, prepared.detail))[: last - first]
+            low = np.asarray(prepared.shown)[: last - first]
+            frame, preview = _shown((prepared.shown, prepared.full), last - first, config)
+            frames.append(at_output(video, low, frame, config))
+            previews.append(preview)
             if picture is not None:
-                others = np.array(picture)[: len(shown)]
-                previews[-1] = woven(previews[-1], others, first - start)
-                frames[-1] = woven(frames[-1], _enlarged(others, photos.images), first - start)
+                frame, preview = _shown(picture, len(shown), config)
+                previews[-1] = woven(previews[-1], preview, first - start)
+                frames[-1] = woven(frames[-1], frame, first - start)
         evaluations += count
     bar.close()
     return Result(
         np.concatenate(frames),
         np.concatenate(previews),
-        to_host(path),
+        _at_frames(to_host(path), config),
         info,
         evaluations,
         tuple(told),
@@ -359,12 +280,41 @@ def sample(
     )
 
 
+def _shown(made, count: int, config: RoGeConfig) -> tuple[np.ndarray, np.ndarray]:
+    """(frames, preview) of `count` targets from the reconstruction's picture alone: (its own size, the output's or None).
+
+    Copies: on a CPU a view would keep the device's array alive.
+    """
+    if made[1] is not None:
+        full = np.array(made[1])[:count]
+        return full, full
+    shown = np.array(made[0])[:count]
+    return _enlarged(shown, *config.output_size), shown
+
+
+def at_output(
+    video: np.ndarray, low: np.ndarray, full: np.ndarray, config: RoGeConfig
+) -> np.ndarray:
+    """A generated video [n, h, w, 3] at the output's size: what the generator changed of the reconstruction's picture
+    `low`, added to that at the output's size `full`."""
+    if config.output_size == video.shape[1:3]:
+        return np.array(video)
+    change = _enlarged(video - _enlarged(low, *video.shape[1:3]), *config.output_size)
+    return np.clip(full + change, 0.0, 1.0)
+
+
+def _at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
+    """Cameras with K in pixels of the frames instead of the model's."""
+    return Cameras(scale_K(path.K, (config.height, config.width), config.output_size), path.c2w)
+
+
 class _Seen(NamedTuple):
-    """What a window sees: images, the same at reconstruction size or None, their cameras in the normalised frame, and
-    which photos and which frames already made they are."""
+    """What a window sees: images, the same at reconstruction size and finer or None, their cameras in the normalised
+    frame, and which photos and which frames already made they are."""
 
     images: np.ndarray
     recon: np.ndarray | None
+    full: np.ndarray | None
     cameras: Cameras
     photos: list[int]
     made: list[int]
@@ -376,13 +326,21 @@ def _seen_later(
     """What a window after the first one sees, of the photos and of the `frames` of the windows before it."""
     start, stop = window
     kept, chosen = chain_views(seen.cameras, target[:start], target[start:stop], config)
-    images, recon = seen.images[kept], seen.recon
+    images = seen.images
     found = [frames[i // config.frames][i % config.frames] for i in chosen]
-    old = np.reshape(found, (-1, *images.shape[1:])).astype(images.dtype)
-    if recon is not None:
-        recon = np.concatenate([recon[kept], _enlarged(old, recon)])
-    cameras = concatenate(seen.cameras[kept], target[np.array(chosen, int)])
-    return _Seen(np.concatenate([images, old]), recon, cameras, kept, chosen)
+    old = np.reshape(found, (-1, *config.output_size, 3)).astype(images.dtype)
+
+    def joined(own: np.ndarray) -> np.ndarray:
+        return np.concatenate([own[kept], _enlarged(old, *own.shape[1:3])])
+
+    return _Seen(
+        joined(images),
+        None if seen.recon is None else joined(seen.recon),
+        None if seen.full is None else joined(seen.full),
+        concatenate(seen.cameras[kept], target[np.array(chosen, int)]),
+        kept,
+        chosen,
+    )
 
 
 def integrate(
@@ -422,8 +380,8 @@ def integrate(
     return jax.block_until_ready(x), done
 
 
-def _enlarged(images: np.ndarray, like: np.ndarray) -> np.ndarray:
-    return np.asarray(model.resized(jnp.asarray(images), *like.shape[1:3]))
+def _enlarged(images: np.ndarray, height: int, width: int) -> np.ndarray:
+    return np.asarray(model.resized(jnp.asarray(images), height, width))
 
 
 def _bar(progress: bool, settings: Settings, grid: np.ndarray, runs: int):

@@ -66,9 +66,10 @@ def window_views(
     config: RoGeConfig,
     *,
     frames: int | None = None,
+    full: np.ndarray | None = None,
 ) -> model.Views:
     """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window, or to
-    `frames`."""
+    `frames`. `recon` and `full`: the images at the reconstruction's size, and finer, where there are any."""
     targets = pad_path(targets, config.frames if frames is None else frames)
     cameras = concatenate(contexts, targets)
     vectors = camera_vector(
@@ -80,7 +81,10 @@ def window_views(
         "c2w": cameras.c2w.astype(np.float32),
         "vectors": np.asarray(vectors, np.float32),
     }
-    return views if recon is None else views | {"context_recon": recon.astype(np.float32)}
+    for name, finer in (("context_recon", recon), ("context_full", full)):
+        if finer is not None:
+            views[name] = finer.astype(np.float32)
+    return views
 
 
 def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:

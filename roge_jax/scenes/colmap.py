@@ -1,4 +1,4 @@
-"""COLMAP models, text and binary: cameras and images, without the points."""
+"""COLMAP models, text and binary: where they lie, their cameras and images, without the points."""
 
 import struct
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from roge_jax.errors import UserError
 from roge_jax.files.fields import read_text
 from roge_jax.geometry.cameras import invert, rotation
-from roge_jax.scenes.images import Frame, Lens
+from roge_jax.scenes.lens import Lens
 
 # Model name and number of parameters by COLMAP's id.
 MODELS = {
@@ -23,35 +23,85 @@ MODELS = {
     8: ("SIMPLE_RADIAL_FISHEYE", 4),
     9: ("RADIAL_FISHEYE", 5),
     10: ("THIN_PRISM_FISHEYE", 12),
+    11: ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    12: ("SIMPLE_DIVISION", 4),
+    13: ("DIVISION", 5),
+    14: ("SIMPLE_FISHEYE", 3),
+    15: ("FISHEYE", 4),
+    16: ("EUCM", 6),
+    17: ("EQUIRECTANGULAR", 2),
 }
+_UNREAD = (
+    "FOV", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE", "SIMPLE_DIVISION", "DIVISION", "EUCM",
+    "EQUIRECTANGULAR",
+)  # fmt: skip
 _ONE_FOCAL = (
     "SIMPLE_PINHOLE",
     "SIMPLE_RADIAL",
     "RADIAL",
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
+    "SIMPLE_FISHEYE",
 )
-_FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+_FISHEYE = (
+    "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE",
+)  # fmt: skip
 
 Camera = tuple[np.ndarray, tuple[int, int], Lens | None]
 
 
-def find_model(folder: Path) -> Path | None:
-    """The folder below `folder` that holds a COLMAP model, if any."""
-    for place in ("sparse/0", "sparse", "colmap/sparse/0", "dense/sparse", "."):
-        for ending in ("bin", "txt"):
-            if all(
-                (folder / place / f"{part}.{ending}").is_file() for part in ("cameras", "images")
-            ):
-                return folder / place
-    return None
+NAMES = ("cameras", "images")
+PLACES = ("sparse", "colmap", "dense", "glomap", "distorted", "model", "models", "aligned")
+DEEPEST = 4  # folders below a scene
 
 
-def read_colmap(folder: Path, model: Path, images: Path) -> list[Frame]:
-    """The registered photos of a COLMAP model in order of their names.
+def holds_model(folder: Path) -> bool:
+    """Whether a folder is a COLMAP model, binary or text."""
+    return any(
+        all((folder / f"{part}.{ending}").is_file() for part in NAMES) for ending in ("bin", "txt")
+    )
 
-    Args: `folder` of the scene (for messages), `model` with cameras and images as .bin or .txt (the
-      binary files win), `images` the folder that the image names are relative to.
+
+def find_models(folder: Path) -> list[Path]:
+    """The COLMAP models of a scene folder: `sparse`, `sparse/N`, `dense/N/sparse`, `colmap/sparse/N` and so on.
+
+    In the order in which they are preferred where they are equally large.
+    """
+    found: list[Path] = []
+
+    def look(place: Path, depth: int) -> None:
+        if holds_model(place):
+            found.append(place)
+        if depth == DEEPEST or not place.is_dir():
+            return
+        for below in sorted(place.iterdir(), key=_place):
+            if below.is_dir() and (below.name.lower() in PLACES or below.name.isdecimal()):
+                look(below, depth + 1)
+
+    look(folder, 0)
+    return sorted(found, key=lambda model: (model == folder, "dense" in model.parts))
+
+
+def _place(folder: Path) -> tuple[int, int, str]:
+    name = folder.name.lower()
+    order = PLACES.index(name) if name in PLACES else len(PLACES)
+    return order, int(name) if name.isdecimal() else -1, name
+
+
+def model_size(model: Path) -> int:
+    """How many photos a model has registered, from the head of its file."""
+    file = model / "images.bin"
+    if file.is_file() and (model / "cameras.bin").is_file():
+        with file.open("rb") as stream:
+            head = stream.read(8)
+        return int(struct.unpack("<Q", head)[0]) if len(head) == 8 else 0
+    return sum(1 for _ in _image_lines(model))
+
+
+def read_model(model: Path) -> list[tuple[str, Camera, np.ndarray]]:
+    """(name, camera, c2w) of the registered photos of a COLMAP model in order of their names.
+
+    cameras and images are .bin or .txt; the binary files win.
     """
     if (model / "images.bin").is_file() and (model / "cameras.bin").is_file():
         cameras, poses = _read_bin(model)
@@ -59,24 +109,23 @@ def read_colmap(folder: Path, model: Path, images: Path) -> list[Frame]:
         cameras, poses = _read_txt(model)
     if not poses:
         raise UserError(
-            f"{folder}: the COLMAP model has no registered images: run the mapper again."
+            f"{model}: the COLMAP model has no registered images: run the mapper again."
         )
-    frames = []
+    found = []
     for name, camera_id, q_wxyz, t in sorted(poses, key=lambda pose: pose[0]):
         if camera_id not in cameras:
             raise UserError(f"{model}: image {name} uses camera {camera_id}, which does not exist.")
         w2c = np.eye(4)
         w2c[:3, :3], w2c[:3, 3] = rotation(np.roll(q_wxyz, -1)), t
-        K, size, lens = cameras[camera_id]
-        frames.append(Frame(images / name, K, invert(w2c), size, lens))
-    return frames
+        found.append((name, cameras[camera_id], invert(w2c)))
+    return found
 
 
 def make_camera(model: str, parameters: np.ndarray, width: int, height: int, where: str) -> Camera:
     """(K, (height, width), lens or None) of COLMAP's or nerfstudio's camera parameters."""
     expected = {name: count for name, count in MODELS.values()}
-    if model not in expected or model in ("FOV", "THIN_PRISM_FISHEYE"):
-        usable = [name for name in expected if name not in ("FOV", "THIN_PRISM_FISHEYE")]
+    if model not in expected or model in _UNREAD:
+        usable = [name for name in expected if name not in _UNREAD]
         raise UserError(
             f"{where}: camera model {model} is not supported (of {', '.join(usable)}): "
             "undistort the photos with COLMAP's image_undistorter."
@@ -110,8 +159,8 @@ def _sized_camera(
 
 def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
     cameras = {}
-    for number, words in _lines(model / "cameras.txt"):
-        where = f"{model / 'cameras.txt'}, line {number}"
+    for number, line in _lines(model / "cameras.txt"):
+        where, words = f"{model / 'cameras.txt'}, line {number}", line.split()
         if not words:
             continue
         try:
@@ -125,16 +174,12 @@ def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
                 else UserError(f"{where}: expected 'id MODEL width height parameters'.")
             ) from None
     poses = []
-    lines = list(_lines(model / "images.txt"))
-    while lines and not lines[0][1]:
-        lines.pop(0)
-    # Two lines per image; the second lists its points and may be empty, so blank lines count.
-    for number, words in lines[::2]:
-        if not words:
-            continue
+    for number, line in _image_lines(model):
+        words = line.split()
         try:
             numbers = np.array([float(word) for word in words[1:8]])
-            poses.append((" ".join(words[9:]), int(words[8]), numbers[:4], numbers[4:]))
+            name = line.split(None, 9)[9]
+            poses.append((name, int(words[8]), numbers[:4], numbers[4:]))
         except (ValueError, IndexError):
             raise UserError(
                 f"{model / 'images.txt'}, line {number}: expected 'id qw qx qy qz tx ty tz camera "
@@ -143,10 +188,49 @@ def _read_txt(model: Path) -> tuple[dict[int, Camera], list]:
     return cameras, poses
 
 
-def _lines(file: Path) -> list[tuple[int, list[str]]]:
-    """(number, words) of every line that is not a comment."""
-    text = read_text(file, "scene file").splitlines()
-    return [(i + 1, line.split()) for i, line in enumerate(text) if not line.startswith("#")]
+def _image_lines(model: Path) -> list[tuple[int, str]]:
+    """(number, text) of the lines of images.txt that are images, also where the lines of points between them are missing.
+
+    Two lines per image by the format; the second lists points (x y id) and may be empty. Exporters leave it out.
+    """
+    lines = _lines(model / "images.txt")
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+    if any(_is_image(text) for _, text in lines[1::2]):
+        return [(n, text) for n, text in lines if text.strip() and not _is_points(text)]
+    return [(number, text) for number, text in lines[::2] if text.strip()]
+
+
+def _is_points(line: str) -> bool:
+    """Whether a line is a list of points: numbers, three a point (x y id)."""
+    words = line.split()
+    try:
+        return len(words) % 3 == 0 and all(float(word) is not None for word in words)
+    except ValueError:
+        return False
+
+
+def _is_image(line: str) -> bool:
+    """Whether a line is an image: ten words, the last of which is no number as the point's would be."""
+    words = line.split(None, 9)
+    if len(words) < 10:
+        return False
+    try:
+        int(words[0]), int(words[8])
+        norm = sum(float(word) ** 2 for word in words[1:5])
+    except ValueError:
+        return False
+    return abs(norm - 1) < 1e-2 and not _is_points(line)
+
+
+def _lines(file: Path) -> list[tuple[int, str]]:
+    """(number, text) of every line that is not a comment; names may hold any character but a line end."""
+    if file.name == "images.txt":  # names may be in any encoding
+        data = file.read_bytes() if file.is_file() else b""
+        text = data.removeprefix(b"\xef\xbb\xbf").decode("utf-8", "surrogateescape").split("\n")
+    else:
+        text = read_text(file, "scene file").split("\n")
+    return [(i + 1, line.rstrip("\r")) for i, line in enumerate(text) if not line.startswith("#")]
 
 
 def _read_bin(model: Path) -> tuple[dict[int, Camera], list]:
@@ -165,7 +249,7 @@ def _read_bin(model: Path) -> tuple[dict[int, Camera], list]:
         for _ in range(struct.unpack_from("<Q", data)[0]):
             *numbers, camera_id = struct.unpack_from("<4d3di", data, at + 4)
             end = data.index(b"\0", at + 64)
-            name = data[at + 64 : end].decode("utf-8")
+            name = data[at + 64 : end].decode("utf-8", "surrogateescape")
             points = struct.unpack_from("<Q", data, end + 1)[0]
             at = end + 9 + 24 * points
             poses.append((name, camera_id, np.array(numbers[:4]), np.array(numbers[4:])))

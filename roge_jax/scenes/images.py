@@ -1,4 +1,4 @@
-"""Photographs from disk: decoding without surprises, and straightening of lens distortion.
+"""Photographs from disk: decoding without surprises.
 
 Every picture comes out as float32 RGB [h, w, 3] in [0, 1], sRGB. What cannot be read that way (HDR,
 CMYK without a profile, damaged files) is refused with the file's name, never guessed.
@@ -6,6 +6,7 @@ CMYK without a profile, damaged files) is refused with the file's name, never gu
 
 import contextlib
 import dataclasses
+import struct
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -14,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from roge_jax.errors import UserError
-from roge_jax.geometry.crops import shift_K
+from roge_jax.scenes.lens import Lens, undistort
 
+HEIC = (".heic", ".heif")  # an iPhone's own; pillow-heif turns them upright itself
 HDR = (".exr", ".hdr", ".pfm")
 MEND = "copy or export the photo again, or leave it out of the scene"
 EXIF_ORIENTATION = 0x0112
@@ -45,29 +47,6 @@ class Header:
         return self.stored[::-1] if self.orientation >= 5 else self.stored
 
 
-@dataclasses.dataclass(frozen=True)
-class Lens:
-    """Distortion of a lens: model "opencv" (k1 k2 p1 p2 [k3 k4 k5 k6]) or "fisheye" (k1..k4)."""
-
-    model: str
-    coefficients: tuple[float, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """One posed photo as a reader found it.
-
-    K [3, 3] is in pixels of a picture of `size` (height, width); None: of the file as it is, (1, 1)
-    : normalised by width and height. c2w [4, 4] has OpenCV axes.
-    """
-
-    file: Path
-    K: np.ndarray
-    c2w: np.ndarray
-    size: tuple[int, int] | None = None
-    lens: Lens | None = None
-
-
 def read_header(file: Path) -> Header:
     """Size, orientation and mode of a picture. Raises UserError if the file is missing or alien."""
     from PIL import Image
@@ -84,6 +63,10 @@ def read_header(file: Path) -> Header:
             transparent = mode != "LAB" and ("A" in bands or "a" in bands)
             alpha = transparent or "transparency" in picture.info
             size = (picture.height, picture.width)
+            if picture.format == "TIFF":  # Pillow says the size after turning
+                size = (int(picture.tag_v2[257]), int(picture.tag_v2[256]))
+    except UserError:
+        raise
     except FileNotFoundError:
         raise UserError(f"{file}: there is no such picture.") from None
     except Image.DecompressionBombError:
@@ -111,11 +94,60 @@ def jpeg_quality(file: Path) -> int | None:
     return int(qualities[np.argmin(np.abs(steps - sum(tables[min(tables)])))])
 
 
+def without_orientation(data: bytes) -> bytes:
+    """The bytes of a TIFF file with its orientation tag set to 1, so that no decoder turns the pixels; others as given.
+
+    Decoders disagree about who turns a TIFF (some turn 8 bits and not 16), so here it is nobody but `_upright`.
+    """
+    order = {b"II": "<", b"MM": ">"}.get(data[:2])
+    if order is None:
+        return data
+    version = struct.unpack_from(order + "H", data, 2)[0]
+    big = version == 43
+    head, count, entry = ("Q", "Q", 20) if big else ("I", "H", 12)
+    patched = bytearray(data)
+    try:
+        at = struct.unpack_from(order + head, data, 8 if big else 4)[0]
+        number = struct.unpack_from(order + count, data, at)[0]
+        at += struct.calcsize(count)
+        for i in range(number):
+            tag, kind = struct.unpack_from(order + "HH", data, at + i * entry)
+            if tag == EXIF_ORIENTATION:
+                value = at + i * entry + (12 if big else 8)
+                struct.pack_into(order + ("I" if kind == 4 else "H"), patched, value, 1)
+    except struct.error:
+        return data
+    return bytes(patched)
+
+
+@contextlib.contextmanager
+def _decodable(file: Path) -> Iterator[Any]:
+    """Pillow's picture on its stored grid: a TIFF's orientation is left to `_upright`."""
+    from PIL import Image
+
+    if file.suffix.lower() not in (".tif", ".tiff"):
+        with _opened(file) as picture:
+            yield picture
+        return
+    import io
+
+    with Image.open(io.BytesIO(without_orientation(file.read_bytes()))) as picture:
+        yield picture
+
+
 @contextlib.contextmanager
 def _opened(file: Path) -> Iterator[Any]:
     """Pillow's picture. Large ones are fine: Pillow warns of them for the sake of web servers."""
     from PIL import Image
 
+    if file.suffix.lower() in HEIC:
+        try:
+            import pillow_heif
+        except ImportError:
+            raise UserError(
+                f"{file}: HEIC needs the package pillow-heif: pip install 'roge_jax[heic]', or export JPEG."
+            ) from None
+        pillow_heif.register_heif_opener()
     # Not within `catch_warnings`, which two threads must not enter at a time.
     warnings.simplefilter("ignore", Image.DecompressionBombWarning)
     with Image.open(file) as picture:
@@ -136,7 +168,7 @@ def read_image(file: Path, *, background: float = 1.0, exif: bool = True) -> np.
         if header.mode not in ("CMYK", "LAB") and _is_deep(file):
             pixels = _read_deep(file)
         else:
-            with _opened(file) as picture:
+            with _decodable(file) as picture:
                 picture.load()
                 pixels = np.asarray(_to_rgb(picture, file), np.float32) / np.float32(255)
     except UserError:
@@ -176,7 +208,8 @@ def _read_deep(file: Path) -> np.ndarray:
         import cv2
     except ImportError:
         raise UserError(f"{file}: needs OpenCV to be read: pip install opencv-python.") from None
-    pixels = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+    data = without_orientation(file.read_bytes())
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None:
         raise UserError(f"{file}: damaged or truncated picture: {MEND}.")
     if pixels.dtype not in (np.uint8, np.uint16):
@@ -223,45 +256,6 @@ def _upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
     return np.rot90(pixels[:, ::-1] if flip else pixels, turns)
 
 
-def ideal_K(K: np.ndarray, lens: Lens, size: tuple[int, int]) -> np.ndarray:
-    """K [3, 3] of the straightened picture of the same size: no empty border, little cut away."""
-    cv2 = _opencv_for_lens()
-    height, width = size
-    centred = shift_K(K, 0.5, 0.5)  # OpenCV's pixel centres are whole numbers
-    if lens.model == "fisheye":
-        k = np.array(lens.coefficients, np.float64)[:4]
-        new = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
-            centred, k, (width, height), np.eye(3), balance=0.0
-        )
-    else:
-        k = np.array(lens.coefficients, np.float64)
-        new, _ = cv2.getOptimalNewCameraMatrix(centred, k, (width, height), 0)
-    return shift_K(np.asarray(new, np.float64), -0.5, -0.5)
-
-
-def undistort(image: np.ndarray, K: np.ndarray, lens: Lens, new_K: np.ndarray) -> np.ndarray:
-    """The picture [h, w, 3] that a pinhole camera with `new_K` would have taken."""
-    cv2 = _opencv_for_lens()
-    size = (image.shape[1], image.shape[0])
-    old, new = shift_K(K, 0.5, 0.5), shift_K(new_K, 0.5, 0.5)
-    k = np.array(lens.coefficients, np.float64)
-    make = cv2.initUndistortRectifyMap
-    if lens.model == "fisheye":
-        make, k = cv2.fisheye.initUndistortRectifyMap, k[:4]
-    across, down = make(old, k, np.eye(3), new, size, cv2.CV_32FC1)
-    return cv2.remap(image, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _opencv_for_lens() -> Any:
-    try:
-        import cv2
-    except ImportError:
-        raise UserError(
-            "Lens distortion needs OpenCV: pip install opencv-python, or give undistorted photos."
-        ) from None
-    return cv2
-
-
 @dataclasses.dataclass(frozen=True)
 class Photo:
     """How one file becomes the picture that its camera describes."""
@@ -273,6 +267,7 @@ class Photo:
     lens: Lens | None = None
     K: np.ndarray | None = None  # of the decoded picture, for the lens
     new_K: np.ndarray | None = None
+    straight: tuple[int, int] | None = None  # size after straightening
     background: float = 1.0
 
     def read(self) -> np.ndarray:
@@ -280,7 +275,9 @@ class Photo:
         image = read_image(self.file, background=self.background, exif=self.exif)
         if self.lens is not None:
             assert self.K is not None and self.new_K is not None
-            image = np.clip(undistort(image, self.K, self.lens, self.new_K), 0.0, 1.0)
+            image = np.clip(
+                undistort(image, self.K, self.lens, self.new_K, self.straight), 0.0, 1.0
+            )
         return np.ascontiguousarray(np.rot90(image, self.quarter_turns))
 
 

@@ -99,6 +99,20 @@ def epipolar_distances(x: np.ndarray, y: np.ndarray, a: Cameras, b: Cameras) -> 
     return np.nan_to_num(0.5 * (each[0] + each[1]), nan=np.inf)
 
 
+def in_front(x: np.ndarray, y: np.ndarray, a: Cameras, b: Cameras) -> float:
+    """The share of matches x, y [p, 2] whose rays come closest to each other in front of both cameras."""
+    rays = []
+    for pixels, camera in ((x, a), (y, b)):
+        local = np.hstack([pixels, np.ones((len(pixels), 1))]) @ np.linalg.inv(camera.K[0]).T
+        rays.append(local @ camera.c2w[0, :3, :3].T)
+    between = b.centres[0] - a.centres[0]
+    aa, bb, ab = (rays[0] ** 2).sum(1), (rays[1] ** 2).sum(1), (rays[0] * rays[1]).sum(1)
+    det = np.maximum(aa * bb - ab**2, 1e-300)
+    first = (bb * (rays[0] @ between) - ab * (rays[1] @ between)) / det
+    second = (ab * (rays[0] @ between) - aa * (rays[1] @ between)) / det
+    return float(np.mean((first > 0) & (second > 0)))
+
+
 def neighbour_pairs(cameras: Cameras, count: int) -> list[tuple[int, int]]:
     """Up to `count` pairs of views spread over the scene that look alike but do not coincide."""
     views = np.unique(np.linspace(0, len(cameras) - 1, count).round().astype(int))
@@ -233,19 +247,27 @@ def pose_agreement(
 ) -> tuple[dict[str, float], int]:
     """Median epipolar distance in pixels under each set of candidate cameras, and the pairs used.
 
-    The first candidate chooses the pairs. Distances are NaN if no pair could be matched.
+    The first candidate chooses the pairs. Another one under which most points would lie behind the cameras is infinitely
+    far: lines alone cannot tell mirrored photos from turned axes. Distances are NaN if no pair could be matched.
     """
-    first = next(iter(candidates.values()))
+    first_name, first = next(iter(candidates.items()))
     medians: dict[str, list[float]] = {name: [] for name in candidates}
     for i, j in neighbour_pairs(first, count):
-        image_i, K_i = shrink(images[i], first.K[i])
-        image_j, K_j = shrink(images[j], first.K[j])
+        image_i, _ = shrink(images[i], first.K[i])
+        image_j, _ = shrink(images[j], first.K[j])
         matches = matched_features(features(image_i), features(image_j))
         if matches is None:
             continue
         for name, cameras in candidates.items():
-            a = Cameras(K_i[None], cameras.c2w[i : i + 1])
-            b = Cameras(K_j[None], cameras.c2w[j : j + 1])
-            medians[name].append(float(np.median(epipolar_distances(*matches, a, b))))
+            a = Cameras(_at(cameras.K[i], images[i], image_i)[None], cameras.c2w[i : i + 1])
+            b = Cameras(_at(cameras.K[j], images[j], image_j)[None], cameras.c2w[j : j + 1])
+            off = float(np.median(epipolar_distances(*matches, a, b)))
+            behind = name != first_name and in_front(*matches, a, b) < 0.5
+            medians[name].append(np.inf if behind else off)
     used = len(next(iter(medians.values())))
     return {n: float(np.median(v)) if v else float("nan") for n, v in medians.items()}, used
+
+
+def _at(K: np.ndarray, image: np.ndarray, smaller: np.ndarray) -> np.ndarray:
+    """K of a photo in pixels of its smaller copy."""
+    return scale_K(K, (image.shape[0], image.shape[1]), (smaller.shape[0], smaller.shape[1]))

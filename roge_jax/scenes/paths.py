@@ -1,6 +1,8 @@
-"""Camera path files, read and written (docs/cameras.md)."""
+"""Camera paths: any file or scene folder as the cameras of a video, and our own path files (docs/cameras.md)."""
 
+import dataclasses
 import json
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,20 +10,39 @@ from typing import Any
 import numpy as np
 
 from roge_jax.errors import UserError, did_you_mean
-from roge_jax.files.fields import matrix, number, read_json
+from roge_jax.files.fields import number
 from roge_jax.geometry.cameras import (
     CONVENTIONS,
     Cameras,
+    CameraWarning,
     crop_resize_K,
     invert,
     opencv_to_opengl,
     to_host,
-    to_opencv,
     validate,
 )
 from roge_jax.geometry.interpolation import interpolate
+from roge_jax.geometry.validation import Finding
+from roge_jax.scenes import world, writers
+from roge_jax.scenes.assemble import Posed, pose_frame
+from roge_jax.scenes.frames import Frame, Reading
+from roge_jax.scenes.readers import read_place
+from roge_jax.scenes.writers import transforms
+
+__all__ = ["LoadedPath", "interpolate", "load_path", "read_path", "save_path", "transforms"]
 
 MOST = 1_000_000  # frames that keyframes are interpolated to: more are a slip of the pen
+KEY_FRAMES = 81  # of key frames that do not say how many frames they make
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedPath:
+    """A path as it was read: its cameras, its frames per second where it says so, and what is to be said about it."""
+
+    cameras: Cameras
+    fps: float | None
+    axes: str = ""  # the convention that its poses were read in, where the format leaves it open
+    notes: tuple[Finding, ...] = ()
 
 
 def save_path(
@@ -32,8 +53,18 @@ def save_path(
     *,
     convention: str = "opencv",
     fps: float | None = None,
+    layout: str = "path",
+    names: Sequence[str] | None = None,
 ) -> None:
-    """Writes cameras [n] of height x width pictures as a path file, every frame with its K."""
+    """Writes cameras [n] of height x width pictures as a path file, every frame with its K.
+
+    layout: "path" is our own; "nerfstudio", "realestate10k", "tum" (a file each), "colmap" and "colmap-binary" (`file`
+    is the folder of the model) are those of other programs, with `names` for the pictures (`writers.write`).
+    """
+    if layout != "path":
+        if convention != "opencv":
+            raise UserError(f"{file}: {layout} has axes of its own: leave 'convention' away.")
+        return writers.write(file, cameras, height, width, layout=layout, names=names, fps=fps)
     if convention not in CONVENTIONS:
         hint = did_you_mean(convention, CONVENTIONS)
         raise UserError(f"Unknown camera convention '{convention}': {hint}")
@@ -49,21 +80,6 @@ def save_path(
     Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1))
 
 
-def transforms(names: Sequence[str], cameras: Cameras, height: int, width: int) -> dict[str, Any]:
-    """nerfstudio's transforms.json of the frames: c2w in OpenGL axes, in the scene's own frame and unit."""
-    frames = []
-    for name, K, pose in zip(names, cameras.K, opencv_to_opengl(cameras.c2w), strict=True):
-        entry = {
-            "file_path": f"frames/{name}",
-            "fl_x": K[0, 0],
-            "fl_y": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
-        }
-        frames.append(entry | {"transform_matrix": pose})
-    return {"camera_model": "OPENCV", "w": width, "h": height, "frames": frames}
-
-
 def load_path(
     file: str | Path,
     *,
@@ -71,173 +87,146 @@ def load_path(
     height: int | None = None,
     width: int | None = None,
     context: Cameras | None = None,
+    convention: str | None = None,
+    frame: world.Frame = None,
+    scene: str | Path | None = None,
 ) -> Cameras:
-    """Cameras [n] (float64, OpenCV, world units) of a path file.
+    """Cameras [n] (float64, OpenCV, world units) of a path file, or of a scene's own file or folder.
 
     Args:
-      file: our format, a nerfstudio camera path (`camera_path`) or a `transforms.json`.
-      frames: how many frames to make of a file with `keyframes`; a file with `frames` is taken as
-        it is and must have this many.
-      height, width: the pictures to make; K is moved there from the file's own size by a centred
-        crop and a resize. Default: K stays in pixels of the file's size.
-      context: whose first K (in pixels of height x width) is used if the file has no intrinsics.
+      file: our format, or any of those of `scenes.readers` (docs/cameras.md lists them).
+      frames: how many frames to make of a file with key frames; others are taken as they are and must have this many.
+      height, width: the pictures to make; K is moved there from the file's own size by a centred crop and a resize.
+        Default: K stays in pixels of the file's size.
+      context: whose first K (in pixels of height x width) is used if the file has no intrinsics, and whose first pose
+        leads a path that is relative to its first camera.
+      convention: axes of the poses where the format leaves them open and the file does not say them.
+      frame: the coordinates of the path: None to find out, "scene", "first" or "first:SCALE" (starts at the first
+        photo), a `dataparser_transforms.json`, or (4x4 that takes the path to the scene, scale of positions before it).
+      scene: where the scene was read from, for `dataparser_transforms.json` and its `applied_transform`.
     Raises: UserError naming the file, the frame and the field.
     """
+    path = read_path(
+        file,
+        frames=frames,
+        height=height,
+        width=width,
+        context=context,
+        convention=convention,
+        frame=frame,
+        scene=scene,
+    )
+    for note in path.notes:
+        if note.severity == "warning":
+            warnings.warn(str(note), CameraWarning, stacklevel=2)
+    return path.cameras
+
+
+def read_path(
+    file: str | Path,
+    *,
+    frames: int | None = None,
+    height: int | None = None,
+    width: int | None = None,
+    context: Cameras | None = None,
+    convention: str | None = None,
+    frame: world.Frame = None,
+    scene: str | Path | None = None,
+) -> LoadedPath:
+    """`load_path` with the file's frame rate and its notes."""
     file = Path(file)
     if frames is not None:
         frames = number(frames, str(file), "frames", low=1, whole=True)
-    content = read_json(file, "path file")
-    if not isinstance(content, dict):
-        raise UserError(f"{file}: expected an object with 'convention' and 'frames'.")
-    entries, field, convention = _entries(content, file)
-    matrices = [_matrix(entry, field, f"{file}, frame {i}") for i, entry in enumerate(entries)]
-    poses = to_opencv(np.stack(matrices), convention)
-    size = _size(content, str(file))
-    target = (height, width) if height and width else size
-    K = [
-        _intrinsics(entry, content, size, target, context, f"{file}, frame {i}")
-        for i, entry in enumerate(entries)
-    ]
-    cameras = Cameras(np.stack(K), poses)
-    names = [f"{file.name} frame {i}" for i in range(len(entries))]
-    middle = np.nan_to_num(np.abs(K[0][[1, 0], 2]), posinf=1.0).clip(1.0, 1e6)
-    guess = (int(2 * middle[0]), int(2 * middle[1]))
-    cameras = validate(cameras, *(target or guess), names)
-    if "keyframes" in content and "camera_path" not in content:
-        times = _times(entries, file)
-        count = content.get("count")
-        count = 81 if count is None else number(count, str(file), "count", low=1, whole=True)
-        if (frames or count) > MOST:
-            raise UserError(f"{file}: {frames or count} frames: give at most {MOST} of them.")
-        s = np.linspace(0.0, 1.0, frames or count)
-        return interpolate(cameras, s, times=times)
-    if frames is not None and frames != len(cameras):
+    target = (height, width) if height and width else None
+    reading = read_place(file, convention=convention, photos=False, target=target)
+    if not reading.frames:
+        raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
+    posed = _posed(reading, file)
+    K, sizes = _intrinsics(reading, posed, target, context, file)
+    poses = np.stack([one.c2w for one in posed])
+    place = Path(scene) if scene is not None and Path(scene).exists() else None
+    first = None if context is None else to_host(context).c2w[0]
+    poses = world.to_scene(poses, frame, reading.frame, file, place, first)
+    names = [f"{file.name} frame {i}" for i in range(len(poses))]
+    heights, widths = zip(*sizes, strict=True)
+    cameras = validate(Cameras(np.stack(K), poses), heights, widths, names, read_as=reading.axes)
+    notes = tuple(note for note in reading.notes if reading.keys or _concerns_a_path(note))
+    if reading.keys:
+        count = frames or reading.count or KEY_FRAMES
+        if count > MOST:
+            raise UserError(f"{file}: {count} frames: give at most {MOST} of them.")
+        times = reading.times
+        cameras = interpolate(cameras, np.linspace(0.0, 1.0, count), times=times)
+    elif frames is not None and frames != len(cameras):
         raise UserError(
             f"{file}: has {len(cameras)} frames but {frames} were asked for: ask for "
             f"{len(cameras)}, or write 'keyframes' to have them interpolated."
         )
-    return cameras
+    return LoadedPath(cameras, reading.fps, reading.axes, notes)
 
 
-def _entries(content: dict, file: Path) -> tuple[list[dict], str, str]:
-    """(frames or key frames, name of their matrix, convention)."""
-    if isinstance(content.get("camera_path"), list):
-        entries, field, default = content["camera_path"], "camera_to_world", "opengl"
-    else:
-        entries = content.get("frames", content.get("keyframes"))
-        foreign = isinstance(entries, list) and any(
-            isinstance(entry, dict) and "transform_matrix" in entry for entry in entries[:1]
+def _concerns_a_path(note: Finding) -> bool:
+    """Notes about masks and photos say nothing about cameras."""
+    return not any(word in note.what for word in ("masks", "photos"))
+
+
+def _posed(reading: Reading, file: Path) -> list[Posed]:
+    """The cameras of the shown pictures; those without intrinsics with the pose alone."""
+    blank = np.eye(3)
+    return [
+        pose_frame(
+            one if one.K is not None else dataclasses.replace(one, file=None, K=blank, lens=None),
+            str(file),
         )
-        field, default = ("transform_matrix", "opengl") if foreign else ("pose", "")
-        if "frames" in content and "keyframes" in content:
-            raise UserError(f"{file}: has both 'frames' and 'keyframes': give one of the two.")
-    if not isinstance(entries, list) or not entries:
-        raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
-    for i, entry in enumerate(entries):
-        if not isinstance(entry, dict):
-            raise UserError(
-                f"{file}, frame {i}: is no object with '{field}': give a 4x4 matrix there."
-            )
-    convention = content.get("convention") or default
-    if convention not in CONVENTIONS:
-        given = f"convention '{convention}'" if convention else "no 'convention'"
-        hint = did_you_mean(str(convention), CONVENTIONS)
-        raise UserError(f"{file}: {given}, so its axes are unknown: {hint}")
-    return entries, field, convention
-
-
-def _matrix(entry: dict, field: str, where: str) -> np.ndarray:
-    """The pose of one entry as [4, 4]."""
-    if field not in entry:
-        raise UserError(f"{where}: has no '{field}': give a 4x4 matrix (rows).")
-    try:
-        matrix = np.asarray(entry[field], np.float64)
-        matrix = matrix.reshape(-1, 4) if matrix.size in (12, 16) else matrix
-        if matrix.shape == (3, 4):
-            matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
-        if matrix.shape != (4, 4):
-            raise ValueError
-    except (ValueError, TypeError):
-        raise UserError(f"{where}: '{field}' must be a 4x4 matrix of numbers (rows).") from None
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(matrix[:3, :3])) < 1e-12:
-        raise UserError(f"{where}: '{field}' has NaN, infinite or singular numbers: fix it.")
-    return matrix
-
-
-_NUMBERS = ("fl_x", "fl_y", "cx", "cy", "fov", "camera_angle_x")
-
-
-def _size(content: dict, where: str) -> tuple[int, int] | None:
-    """(height, width) of the pictures that the file's intrinsics are for."""
-    for names in (("height", "width"), ("h", "w"), ("render_height", "render_width")):
-        given = [name for name in names if content.get(name) is not None]
-        if len(given) == 1:
-            raise UserError(
-                f"{where}: has '{given[0]}' alone: give both '{names[0]}' and '{names[1]}'."
-            )
-        if given:
-            height, width = (number(content[n], where, n, low=1, whole=True) for n in names)
-            return height, width
-    return None
+        for one in reading.frames
+    ]
 
 
 def _intrinsics(
-    entry: dict,
-    content: dict,
-    size: tuple[int, int] | None,
+    reading: Reading,
+    views: list[Posed],
     target: tuple[int, int] | None,
     context: Cameras | None,
-    where: str,
-) -> np.ndarray:
-    """K [3, 3] of one entry in pixels of `target`: its own, else the file's, else the context's."""
-    known = ("K", "fl_x", "fl_y", "fov", "camera_angle_x")
-    sources = ({k: v for k, v in s.items() if v is not None} for s in (entry, content))
-    source = next((s for s in sources if any(k in s for k in known)), None)
-    if source is None:
-        if context is None:
-            raise UserError(f"{where}: no intrinsics: give 'K' (3x3, pixels) or 'fov' (degrees).")
-        return to_host(context).K[0]
-    value = {name: number(source[name], where, name) for name in _NUMBERS if name in source}
-    if "K" in source:
-        K = matrix(source["K"], (3, 3), where, "K")
-    elif "fl_x" in value:
-        middle = (0.0, 0.0) if size is None else (size[1] / 2, size[0] / 2)
-        cx, cy = value.get("cx", middle[0]), value.get("cy", middle[1])
-        K = np.array(
-            [[value["fl_x"], 0, cx], [0, value.get("fl_y", value["fl_x"]), cy], [0, 0, 1.0]]
-        )
-    elif "fl_y" in value:
-        raise UserError(f"{where}: has 'fl_y' alone: give 'fl_x' (pixels) as well.")
-    else:
-        size = size or target
-        name = "fov" if "fov" in value else "camera_angle_x"
-        if size is None:
-            raise UserError(f"{where}: '{name}' needs the picture size: give 'height' and 'width'.")
-        angle, side = value[name], size[0]
-        if name == "fov" and not 0 < angle < 180:
-            raise UserError(f"{where}: fov {angle} is the full vertical angle: 0 to 180 degrees.")
-        if name == "camera_angle_x":
-            if not 0 < angle < np.pi:
+    file: Path,
+) -> tuple[list[np.ndarray], list[tuple[int, int]]]:
+    """K of every frame in pixels of `target` (or of its own picture), and the sizes of those pictures."""
+    found, sizes = [], []
+    for i, (one, posed) in enumerate(zip(reading.frames, views, strict=True)):
+        where = f"{file}, frame {i}"
+        if one.K is None:
+            if context is None:
                 raise UserError(
-                    f"{where}: camera_angle_x {angle} is the full horizontal angle: 0 to 3.14 radians."
+                    f"{where}: no intrinsics: give 'K' (3x3, pixels) or 'fov' (degrees)."
                 )
-            angle, side = np.degrees(angle), size[1]
-        focal = 0.5 * side / np.tan(np.radians(angle) / 2)
-        K = np.array([[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1.0]])
-    if target is None:
-        return K
-    if size is None:
-        raise UserError(f"{where}: K needs the picture size it is for: give 'height' and 'width'.")
-    return K if size == target else crop_resize_K(K, size, target)
+            found.append(to_host(context).K[0])
+            sizes.append(target or _guess(found[-1]))
+            continue
+        if target is None or posed.size == target:
+            found.append(posed.K)
+            sizes.append(posed.size or target or _guess(posed.K))
+            continue
+        if posed.size is None:
+            raise UserError(
+                f"{where}: K needs the picture size it is for: give 'height' and 'width'."
+            )
+        found.append(_moved(posed.K, posed.size, target, one))
+        sizes.append(target)
+    return found, sizes
 
 
-def _times(entries: list[dict], file: Path) -> np.ndarray | None:
-    """The `time` of every key frame, or None if none has one."""
-    if not any("time" in entry for entry in entries):
-        return None
-    times = np.array(
-        [number(e.get("time", np.nan), f"{file}, frame {i}", "time") for i, e in enumerate(entries)]
-    )
-    if not np.all(np.diff(times) > 0):
-        raise UserError(f"{file}: 'time' must be on every key frame, in increasing order.")
-    return times
+def _moved(K: np.ndarray, size: tuple[int, int], target: tuple[int, int], one: Frame) -> np.ndarray:
+    """K after a centred crop and a resize: to whole pixels where there is a photo to be cropped, else exactly."""
+    if one.file is not None:
+        return crop_resize_K(K, size, target)
+    factor = max(target[0] / size[0], target[1] / size[1])
+    moved = K.copy()
+    moved[:2] *= factor
+    moved[0, 2] -= 0.5 * (size[1] * factor - target[1])
+    moved[1, 2] -= 0.5 * (size[0] * factor - target[0])
+    return moved
+
+
+def _guess(K: np.ndarray) -> tuple[int, int]:
+    """A picture size from the principal point, where nobody says one."""
+    middle = np.nan_to_num(np.abs(K[[1, 0], 2]), posinf=1.0).clip(1.0, 1e6)
+    return int(2 * middle[0]), int(2 * middle[1])

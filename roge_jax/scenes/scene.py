@@ -15,14 +15,14 @@ from roge_jax.geometry.cameras import (
     CameraWarning,
     crop_resize,
     crop_resize_K,
-    scale_K,
     to_host,
-    turn,
     validate,
 )
 from roge_jax.geometry.validation import Finding
-from roge_jax.scenes.images import QUARTER_TURNS, Frame, Header, Photo, Photos, ideal_K, read_header
-from roge_jax.scenes.readers import read_frames
+from roge_jax.scenes.assemble import pose_frame
+from roge_jax.scenes.frames import Reading
+from roge_jax.scenes.images import Photos
+from roge_jax.scenes.readers import read_scene, transforms_of
 
 __all__ = [
     "Scene",
@@ -42,7 +42,8 @@ class Scene:
 
     images: a sequence of float32 RGB [h, w, 3] in [0, 1], decoded on access when they are files;
       sizes may differ. depths: z-depth [h, w] per view in the scene's unit where it is known, NaN
-      where it is not. notes: what reading changed or assumed, as findings.
+      where it is not. notes: what reading changed, assumed or left out, as findings. axes: the convention the poses were
+      read in where the layout leaves it open.
     """
 
     images: Sequence[np.ndarray]
@@ -51,6 +52,7 @@ class Scene:
     source: str
     depths: Sequence[np.ndarray] | None = None
     notes: tuple[Finding, ...] = ()
+    axes: str = ""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -78,7 +80,7 @@ def load_scene(spec: str | Path, **options: Any) -> Scene:
             warnings.warn(str(note), CameraWarning, stacklevel=2)
     heights, widths = zip(*scene.sizes, strict=True)
     try:
-        cameras = validate(scene.cameras, heights, widths, scene.names)
+        cameras = validate(scene.cameras, heights, widths, scene.names, read_as=scene.axes)
     except UserError as error:
         raise UserError(f"{scene.source}: {error}") from None
     return dataclasses.replace(scene, cameras=cameras)
@@ -99,7 +101,7 @@ def open_scene(
     """A scene as it is, its cameras unchecked (`check` uses this to report all that is wrong).
 
     Args:
-      convention: axes of the poses of a `transforms.json` if they are not OpenGL.
+      convention: axes of the poses of a `transforms.json` if they are not OpenGL (of TUM, KITTI and npz: not OpenCV).
       exif: "auto" turns photos upright as their EXIF tag says (poses and K too, if K is plainly for
         the stored grid), "ignore" takes the stored grid.
       background: what transparent pixels show, 1 is white.
@@ -118,100 +120,62 @@ def open_scene(
     if not name or (not exists(Path(spec)) and "/" not in name and "." not in name):
         hint = did_you_mean(name, ("motorcycle", "procedural:SEED"))
         raise UserError(f"There is no scene '{name}', neither a folder nor built in: {hint}")
-    found = read_frames(Path(spec), convention=convention, camera=camera)
+    found = read_scene(Path(spec), convention=convention, camera=camera)
     return _assemble(found, name, exif, background)
 
 
 def is_nerfstudio(source: str) -> bool:
     """Whether a scene was read from a `transforms.json`, the only layout whose axes have to be believed."""
-    path = Path(source)
-    return path.suffix == ".json" or (path / "transforms.json").is_file()
+    return transforms_of(Path(source))
 
 
-def _assemble(frames: list[Frame], source: str, exif: str, background: float) -> Scene:
-    """Frames to a scene: sizes, orientation, scale of K, lens. Pixels are not decoded yet."""
-    photos, Ks, poses = [], [], []
+def _assemble(reading: Reading, source: str, exif: str, background: float) -> Scene:
+    """A reading as a scene. Pixels are not decoded yet."""
     notes: dict[str, Finding] = {}
-
-    def note(severity: str, what: str, fix: str) -> None:
-        notes.setdefault(what, Finding(severity, source, what, fix))
-
-    for frame in frames:
-        header = read_header(frame.file)
-        use_tag, turns = _orientation(header, frame, exif)
-        size = header.displayed if use_tag else header.stored
-        K, pose = _fit_K(frame, size), frame.c2w
-        photo = Photo(frame.file, size, use_tag, turns, background=background)
-        if frame.lens is not None and np.isfinite(K).all():
-            new_K = _straightened_K(K, frame, size)
-            photo = dataclasses.replace(photo, lens=frame.lens, K=K, new_K=new_K)
-            K = new_K
-            note("note", f"photos have {frame.lens.model} lens distortion", "it is removed")
-        if turns:
-            K, pose = turn(K, pose, turns, *size)
-            upright = size[::-1] if turns % 2 else size
-            photo = dataclasses.replace(photo, size=upright)
-        if header.alpha:
-            note("warning", "photos are transparent", f"they show background {background:g} there")
-        if header.orientation != 1:
-            note("note", "photos carry an EXIF orientation", "see docs/cameras.md if they lie down")
-        if frame.size not in (None, size, (1, 1)):
-            what = f"intrinsics are for {frame.size[1]} x {frame.size[0]} pixels"
-            note("note", what, f"they are scaled to the photos, {size[1]} x {size[0]}")
-        photos.append(photo)
-        Ks.append(K)
-        poses.append(pose)
-    names = tuple(frame.file.name for frame in frames)
-    cameras = Cameras(np.stack(Ks), np.stack(poses))
-    return Scene(Photos(photos), cameras, names, source, notes=tuple(notes.values()))
+    posed = [pose_frame(f, source, exif=exif, background=background) for f in reading.frames]
+    for note in (note for one in posed for note in one.notes):
+        notes.setdefault(note.what, note)
+    cameras = Cameras(np.stack([one.K for one in posed]), np.stack([one.c2w for one in posed]))
+    photos = Photos([one.photo for one in posed if one.photo is not None])
+    names = _names([frame.address() for frame in reading.frames], [f.file for f in reading.frames])
+    told = [dataclasses.replace(note, where=source) for note in reading.notes]
+    everything = (*told, *notes.values())
+    return Scene(photos, cameras, names, source, notes=everything, axes=reading.axes)
 
 
-def _straightened_K(K: np.ndarray, frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    assert frame.lens is not None
-    new_K = ideal_K(K, frame.lens, size)
-    zoom = new_K[[0, 1], [0, 1]] / np.maximum(np.abs(K[[0, 1], [0, 1]]), 1e-300)
-    if not (np.isfinite(new_K).all() and (zoom > 0.02).all() and (zoom < 50).all()):
-        raise UserError(
-            f"{frame.file}: lens coefficients {frame.lens.coefficients} leave no usable picture (the focal length "
-            f"would change by a factor of {zoom[0]:.3g}): check them."
-        )
-    return new_K
+def _names(addresses: list[str], files: list[Path | None]) -> tuple[str, ...]:
+    """The files' own names, or where these are not unique those relative to the folder of the photos."""
+    short = [file.name if file else name for name, file in zip(addresses, files, strict=True)]
+    if len(set(short)) == len(short):
+        return tuple(short)
+    return tuple(addresses)
 
 
-def _orientation(header: Header, frame: Frame, exif: str) -> tuple[bool, int]:
-    """(apply the EXIF tag while decoding, quarter turns of picture and camera afterwards).
+def find_view(scene: Scene, word: str) -> int | None:
+    """The view that a user means by a name: the scene's own, or the end of one while that is unique.
 
-    K is taken to be for the upright picture unless its size fits only the stored grid; then the
-    poses belong to that grid too, and picture, K and pose are turned together.
+    `000.png` for `cam1/000.png` where no other camera has one, `images/000.png` for `000.png`; None if there is none.
+    Raises: UserError with the candidates where there are several.
     """
-    if exif == "ignore":
-        return False, 0
-    if frame.size in (None, (1, 1)) or header.orientation < 5:
-        return True, 0
-    assert frame.size is not None
-    height, width = frame.size
-    for_stored = _aspect_gap((height, width), header.stored) < 0.02
-    for_upright = _aspect_gap((height, width), header.displayed) < 0.02
-    if for_upright or not for_stored:
-        return True, 0
-    # A mirrored picture (5, 7) is no camera's picture: it stays on its grid.
-    return False, QUARTER_TURNS.get(header.orientation, 0)
-
-
-def _aspect_gap(a: tuple[int, int], b: tuple[int, int]) -> float:
-    return abs((a[1] / a[0]) / (b[1] / b[0]) - 1.0)
-
-
-def _fit_K(frame: Frame, size: tuple[int, int]) -> np.ndarray:
-    """K in pixels of the picture of this size, whatever size the file says it is for."""
-    if frame.size is None or frame.size == size:
-        return frame.K
-    if frame.size != (1, 1) and _aspect_gap(frame.size, size) > 0.02:
-        raise UserError(
-            f"{frame.file}: is {size[1]} x {size[0]} pixels but its intrinsics are for "
-            f"{frame.size[1]} x {frame.size[0]}: correct 'w' and 'h', or do not crop the photo."
-        )
-    return scale_K(frame.K, frame.size, size)
+    plain = word.replace("\\", "/").removeprefix("./")
+    for spelling in (word, plain):
+        if spelling in scene.names:
+            return scene.names.index(spelling)
+    files = (
+        [photo.file.as_posix() for photo in scene.images.photos]
+        if isinstance(scene.images, Photos)
+        else []
+    )
+    for names in (scene.names, files):
+        ends = [i for i, name in enumerate(names) if f"/{name}".endswith(f"/{plain}")]
+        if len(ends) == 1:
+            return ends[0]
+        if ends:
+            some = ", ".join(scene.names[i] for i in ends[:4])
+            raise UserError(
+                f"{scene.source}: '{word}' could be {len(ends)} photos: give the longer name, of {some}."
+            )
+    return None
 
 
 def _motorcycle() -> Scene:

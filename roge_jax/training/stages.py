@@ -253,14 +253,11 @@ def stage_config(config: RoGeConfig, stage: Stage) -> RoGeConfig:
     frames = (
         stage.views.targets if stage.objective in ("joint", "prior", "encoded") else config.frames
     )
-    return dataclasses.replace(
-        config,
-        height=size[0],
-        width=size[1],
-        recon_height=size[0] * config.recon_height // (shrink * config.height),
-        recon_width=size[1] * config.recon_width // (shrink * config.width),
-        frames=frames,
+    recon = (
+        size[0] * config.recon_height // (shrink * config.height),
+        size[1] * config.recon_width // (shrink * config.width),
     )
+    return dataclasses.replace(config.at_size(*size, recon), frames=frames)
 
 
 def stage_batch(

@@ -173,9 +173,7 @@ def resize(cfg: RoGeConfig, size: str | None, *, hires: bool) -> RoGeConfig:
     recon = cfg.recon_height, cfg.recon_width
     if not hires:
         recon = height * recon[0] // cfg.height // 8 * 8, width * recon[1] // cfg.width // 8 * 8
-    return dataclasses.replace(
-        cfg, height=height, width=width, recon_height=recon[0], recon_width=recon[1]
-    )
+    return cfg.at_size(height, width, recon)
 
 
 def on_host() -> contextlib.AbstractContextManager:

@@ -197,7 +197,7 @@ def schedule(
     "uniform"    linspace(1, 0); `shift` does not apply
     "graded"     u^power, finer towards 0; with `sigma_min` it walks to there and jumps to 0
     "optimised"  found offline for `solver` on the weights of `model` (a config's name), read from
-                 schedules.json; experiments/optimise_schedules.py finds them
+                 schedules.json; python -m experiments.quality.optimise_schedules finds them
 
     `breaks`: noise levels that must be grid points, such as the ends of a guidance interval; the
     pieces between them are stretched, the number of steps stays.
@@ -255,7 +255,7 @@ def _optimised(steps: int, solver: str, model: str | None) -> np.ndarray:
         raise UserError(
             f"No optimised schedule of model '{model}' for solver '{solver}' with {steps} steps is stored; "
             f"there is {have or 'none for this model'}. Use another schedule, or find one with "
-            "experiments/optimise_schedules.py."
+            "python -m experiments.quality.optimise_schedules."
         )
     return np.asarray(stored[solver][steps], np.float64)
 

@@ -56,3 +56,24 @@ def test_a_scene_that_fails_leaves_nothing(scene, tmp_path, capsys):
     assert not list(tmp_path.glob("p*"))
     assert main([str(scene), "--out", str(tmp_path / "p"), "--frames", "0"]) == 2
     assert "'0' is not a whole number of at least 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shuffled", [True, False])
+def test_runs_follow_the_walk(tmp_path, capsys, shuffled):
+    """Photos listed in another order than they were taken in: sequences are consecutive all the same, and it is told."""
+    import json
+
+    folder = nerfstudio(tmp_path / "scene", truth(12))
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    order = np.random.default_rng(0).permutation(12) if shuffled else np.arange(12)
+    content["frames"] = [content["frames"][i] for i in order]
+    file.write_text(json.dumps(content))
+    assert pack([folder], tmp_path / "pool", frames=12, height=12, width=20) == 1
+    pool = read_pool(tmp_path / "pool")
+    np.testing.assert_allclose(pool[0]["c2w"], truth(12).c2w, atol=1e-9)
+    walk = load_scene(nerfstudio(tmp_path / "walk", truth(12)))
+    images, cameras = prepare(walk, range(12), 12, 20)
+    np.testing.assert_allclose(pool[0]["rgb"] / 255.0, images, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(pool[0]["K"], cameras.K)
+    assert ("in the order of their names" in capsys.readouterr().out) == shuffled

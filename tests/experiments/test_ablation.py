@@ -2,18 +2,20 @@
 
 import dataclasses
 import re
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-from ablation_parts import adaptation, common, generator, reconstruction, report, transformer
-
+from experiments.ablation import (
+    adaptation,
+    common,
+    generator,
+    reconstruction,
+    report,
+    transformer,
+)
 from roge_jax import model
 from roge_jax.config import preset
 from roge_jax.core.layers import patch_conv

@@ -1,24 +1,17 @@
 """The experiment on the trained model: what it measures and how it decides."""
 
 import argparse
-import json
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-import mini_quality
-import work_precision
-from mini_quality import verdict
-from quality import charts, knobs, scenes
-from quality.measures import GAP, consistency, same_surface
-from quality.scenes import CONTEXTS, REPEATS, Sampler, Scenes, most_steps, photos
-
+from experiments import harness
+from experiments.quality import charts, knobs, mini, scenes, work_precision
+from experiments.quality.measures import GAP, consistency, same_surface
+from experiments.quality.mini import verdict
+from experiments.quality.scenes import CONTEXTS, REPEATS, Sampler, Scenes, most_steps, photos
 from roge_jax import model
 from roge_jax.checkpoint import weights_fingerprint
 from roge_jax.config import FlowConfig, preset
@@ -26,7 +19,6 @@ from roge_jax.core.params import flatten, unflatten
 from roge_jax.video.solvers import nfe
 
 OWN = FlowConfig()
-ROOT = Path(__file__).parents[2]
 
 
 def test_photos_are_spread_and_targets_are_the_same_for_every_number_of_photos():
@@ -113,18 +105,18 @@ def test_a_goal_is_reached_by_any_sampler_with_the_psnr_and_the_sharpness_of_eul
 
 
 def test_the_page_states_the_goals_as_the_rule_judges_the_stored_records():
-    report = json.loads((ROOT / "experiments" / "results" / "mini_quality.json").read_text())
+    report = harness.read("mini_quality.json")
     found = verdict(report["records"], report["euler50"]["metrics"], preset("mini").flow)
-    page = (ROOT / "docs" / "solvers.md").read_text()
+    page = (harness.DOCS / "solvers.md").read_text()
     assert "\n".join(charts.goals(found)) in page
 
 
-def test_tables_replace_only_what_lies_between_the_markers():
+def test_tables_have_the_best_of_each_budget():
     euler = point("euler", 50, 0.02, 0.0, 0.5)
     records = [point("ab2", 4, 0.05, 0.3, 0.48), point("ab2", 8, 0.01, 0.05, 0.5)]
     report = {
         "settings": {
-            "command": "python experiments/mini_quality.py",
+            "command": "python -m experiments.quality.mini",
             "scenes": [5, 6],
             "photos": 3,
             "weights": "abc",
@@ -139,13 +131,7 @@ def test_tables_replace_only_what_lies_between_the_markers():
         "verdict": verdict(records, euler["metrics"], OWN),
         "knobs": [],
     }
-    text = "before\n<!-- mini_quality: written by the experiment -->\nold\n<!-- /mini_quality -->\nafter\n"
-    once = charts.with_tables(text, report)
-    assert once.startswith("before\n") and once.endswith("\nafter\n") and "old" not in once
-    assert "| 8 | uniform | `ab2`, 8 | 0.0100 |" in once
-    assert charts.with_tables(once, report) == once
-    document = ROOT / "docs" / "solvers.md"
-    assert "<!-- mini_quality: written by the experiment -->" in document.read_text()
+    assert "| 8 | uniform | `ab2`, 8 | 0.0100 |" in charts.tables(report)
 
 
 def test_a_budget_is_never_overdrawn():
@@ -158,7 +144,7 @@ def test_a_budget_is_never_overdrawn():
 
 def test_seconds_leave_out_the_first_call_and_are_median_and_ends(monkeypatch):
     clock, lasts = [0.0], iter([100.0, 3.0, 1.0, 2.0])
-    monkeypatch.setattr(scenes.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(harness.time, "perf_counter", lambda: clock[0])
 
     def call():
         clock[0] += next(lasts)
@@ -184,7 +170,7 @@ def test_nothing_compiles_while_a_sampler_is_timed(monkeypatch, caplog):
         seen.append(sum("Finished XLA compilation" in r.getMessage() for r in caplog.records))
         return float(len(seen))
 
-    monkeypatch.setattr(scenes.time, "perf_counter", clock)
+    monkeypatch.setattr(harness.time, "perf_counter", clock)
     sampler, made = sampler_of((2, 3, 5, 7, 11)), []
 
     def start():
@@ -245,8 +231,8 @@ def test_samplers_are_drawn_against_evaluations_and_seconds(monkeypatch):
     """Error, PSNR and consistency against both, for every solver; slowest and fastest runs as bars."""
     records = [point(s, n, 0.5 / n, 0.8 / n, 0.5) for s in ("euler", "ab2") for n in (4, 8)]
     drawn = []
-    monkeypatch.setattr(charts, "save", lambda figure, path: drawn.append(figure))
-    charts.samplers(report_of(records), Path("unused"))
+    monkeypatch.setattr(harness, "save", lambda figure, path: drawn.append(figure))
+    charts.samplers(report_of(records), "unused")
     (figure,) = drawn
     column = [ax for ax in figure.axes if ax.get_subplotspec().colspan.start == 0]
     wanted = {
@@ -289,9 +275,9 @@ def test_bfloat16_and_shared_refinement_are_drawn_among_the_knobs(monkeypatch):
         *(knob("refinement", k, relative_difference_of_features=gap) for k, gap in gaps.items()),
     ]
     drawn = []
-    monkeypatch.setattr(charts, "save", lambda figure, path: drawn.append(figure))
+    monkeypatch.setattr(harness, "save", lambda figure, path: drawn.append(figure))
     report = report_of(records) | {"knobs": points, "settings": {}}
-    charts.knobs(report, Path("unused"))
+    charts.knobs(report, "unused")
     panels = {ax.get_title(): [t.get_text() for t in ax.texts] for ax in drawn[0].axes}
     numbers = "\n".join(panels["numbers of the weights, default sampler"])
     assert "float32" in numbers and "bfloat16" in numbers and "-0.012 dB" in numbers
@@ -307,10 +293,10 @@ def test_quartiles_of_the_work_precision_chart():
 def test_the_experiment_runs_from_weights_to_document(tmp_path, monkeypatch):
     """A few points of every part, on the shipped model."""
     document = tmp_path / "solvers.md"
-    document.write_text((ROOT / "docs" / "solvers.md").read_text())
-    monkeypatch.setattr(mini_quality, "OUT", tmp_path)
-    monkeypatch.setattr(mini_quality, "DOCUMENT", document)
-    monkeypatch.setattr(mini_quality, "TOLERANCES", (0.3,))
+    document.write_text((harness.DOCS / "solvers.md").read_text())
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
+    monkeypatch.setattr(harness, "DOCS", tmp_path)
+    monkeypatch.setattr(mini, "TOLERANCES", (0.3,))
     monkeypatch.setattr(knobs, "PHOTOS", (3,))
     monkeypatch.setattr(knobs, "SIZES", ((48, 80),))
     monkeypatch.setattr(knobs, "PEER_STEPS", (2,))
@@ -321,8 +307,8 @@ def test_the_experiment_runs_from_weights_to_document(tmp_path, monkeypatch):
         "budgets": [4, 8],
         "generation_only": None,
     }
-    mini_quality.main(argparse.Namespace(**args, reference=8))
-    report = json.loads((tmp_path / "mini_quality.json").read_text())
+    mini.main(argparse.Namespace(**args, reference=8))
+    report = harness.read("mini_quality.json")
     assert {r["evaluations"] for r in report["records"] if r["solver"] == "euler"} == {4, 8}
     wanted = {"M", "steps", "resolution", "numbers", "cache", "refinement", "ceiling"}
     assert {r["knob"] for r in report["knobs"]} == wanted

@@ -3,27 +3,22 @@
 import dataclasses
 import functools
 import json
-import sys
 import types
-from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "experiments"))
-
-import plan_ladder
-import plan_report
-from plan_runs import CONTEXTS, Engine, LadderScene, make, rms, seen_less
-
+from experiments import harness
+from experiments.planning import ladder as program
+from experiments.planning import report
+from experiments.planning.runs import CONTEXTS, Engine, LadderScene, make, rms, seen_less
 from roge_jax import checkpoint, model, sampling
 from roge_jax.config import preset
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.planning.options import Option, full_choices
 from roge_jax.procedural.scenes import HELDOUT_SEED
 
-ROOT = Path(__file__).parents[2]
 TOLERANCE = 0.02
 FULL = 100.0  # GFLOP
 
@@ -39,7 +34,7 @@ def ladder(planner, *, predicted=None, tolerance=TOLERANCE, **controls):
 
     rows = []
     for i, own in enumerate(planner):
-        others = {n: entry(controls[n][i]) if n in controls else None for n in plan_report.CONTROLS}
+        others = {n: entry(controls[n][i]) if n in controls else None for n in report.CONTROLS}
         expected = 0.001 * (i + 1) if predicted is None else predicted[i]
         plan = {"tolerance": tolerance, "predicted": expected, "planner": entry(own), **others}
         row = {"rung": "plane", "seed": i, "bits_per_pixel": 8.0, "plans": [plan]}
@@ -48,7 +43,7 @@ def ladder(planner, *, predicted=None, tolerance=TOLERANCE, **controls):
 
 
 def methods(rows):
-    return plan_report.summarise(rows)["by_tolerance"][f"{TOLERANCE:g}"]
+    return report.summarise(rows)["by_tolerance"][f"{TOLERANCE:g}"]
 
 
 SPENT = (20, 20, 20, 40, 60, 80)  # mean 40, median 30
@@ -127,16 +122,14 @@ def test_differences_of_either_sign_decide_nothing():
 
 def test_words_and_table_say_where_the_planner_does_not_win():
     fixed, random = [(30, 0.012)] * 6, [(40, 0.010 + d) for d in (4e-3, -3e-3) * 3]
-    summary = plan_report.summarise(ladder([(40, 0.010)] * 6, fixed=fixed, random=random))
-    told = plan_report.words(summary).splitlines()
+    summary = report.summarise(ladder([(40, 0.010)] * 6, fixed=fixed, random=random))
+    told = report.words(summary).splitlines()
     lines = {line.partition(":")[0]: line for line in told if ":" in line}
     assert "error at no more compute: beaten at 0.02" in lines["fixed"]
     assert "NOT beaten at 0.02 (the control is better)" in lines["fixed"]
     assert "error at no more compute: NOT beaten at 0.02;" in lines["random"]
     assert lines["uniform"] == "uniform: no plan of that cost"
-    rows = [
-        [cell.strip() for cell in r.split("|")] for r in plan_report.table(summary).splitlines()
-    ]
+    rows = [[cell.strip() for cell in r.split("|")] for r in report.table(summary).splitlines()]
     cells = {row[2]: row for row in rows if row[1] == f"{TOLERANCE:g}"}
     assert cells["planner"][3] == "40.0 / 40.0" and cells["planner"][5] == "6 of 6"
     assert cells["fixed"][8].startswith("-10 ") and "control better" in cells["fixed"][8]
@@ -150,27 +143,18 @@ def test_the_rank_correlation_leaves_out_the_full_model():
     planner = [(40, e) for e in errors] + [(FULL, 0.0)] * 3
     for predicted, expected in ((errors, 1.0), (errors[::-1], -1.0)):
         rows = ladder(planner, predicted=[*predicted, 0.0, 0.0, 0.0])
-        summary = plan_report.summarise(rows)
+        summary = report.summarise(rows)
         assert summary["spearman"] == pytest.approx(expected) and summary["points"] == 4
     low, middle, high = summary["realised_over_predicted"]
     assert low < middle < high and middle == pytest.approx((11 / 12 + 12 / 11) / 2)
 
 
-def test_picture_and_page_are_written_where_controls_have_no_plan(tmp_path):
+def test_the_picture_is_drawn_where_controls_have_no_plan(tmp_path):
     rows = ladder(PLANNER, fixed=[(40, 0.02)] * 6, random=[None, *[(20, 0.015)] * 5])
-    document = {"rows": rows, "summary": plan_report.summarise(rows)}
+    document = {"rows": rows, "summary": report.summarise(rows)}
     json.dumps(document, allow_nan=False)
-    plan_report.draw(document, tmp_path / "ladder.png")
+    report.draw(document, tmp_path / "ladder.png")
     assert (tmp_path / "ladder.png").stat().st_size > 10_000
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{plan_report.BEGIN}\nold\n{plan_report.END}\nafter\n")
-    plan_report.write_table(document, page)
-    text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("\nafter\n") and "old" not in text
-    assert plan_report.table(document["summary"]) in text
-    page.write_text("no marks")
-    with pytest.raises(ValueError, match="around the table"):
-        plan_report.write_table(document, page)
 
 
 # ---- controls keep to their budgets ----------------------------------------------------------------
@@ -200,12 +184,12 @@ def scene(engine):
 
 
 def test_uniform_plans_use_any_number_of_photos_and_never_exceed_the_budget(engine, scene):
-    ladder = plan_ladder.uniform_plans(engine, scene)
-    most, full = plan_ladder.best_within(ladder, np.inf)
+    ladder = program.uniform_plans(engine, scene)
+    most, full = program.best_within(ladder, np.inf)
     whole = full_choices(scene.photos, engine.config, scene.path, engine.settings)
     assert full.photos == whole.photos and full.steps == whole.steps and full.recon == whole.recon
     budgets = np.geomspace(1e-3 * most, 1.01 * most, 600)
-    found = [plan_ladder.best_within(ladder, budget) for budget in budgets]
+    found = [program.best_within(ladder, budget) for budget in budgets]
     none = [plan is None for plan in found]
     assert none[0] and not none[-1] and none == sorted(none, reverse=True)
     plans = [(plan, budget) for plan, budget in zip(found, budgets, strict=True) if plan]
@@ -231,7 +215,7 @@ def test_a_fixed_plan_is_the_best_predicted_within_its_budget(engine, scene):
     # Means 0.030 for 50, 0.040 for 30, 0.035 for 20; the second scene alone would take the last.
     kinds = {50.0: (2, True), 49.9: (2, False), 20.0: (2, False), 19.9: None}
     for budget, expected in kinds.items():
-        found = plan_ladder.fixed_plan(listed, budget)
+        found = program.fixed_plan(listed, budget)
         assert (found and (len(found.photos), found.generated > 0)) == expected
 
 
@@ -239,21 +223,21 @@ def test_random_plans_are_drawn_from_just_below_the_budget(engine, scene):
     costs = (10.0, 84.0, 86.0, 95.0, 100.0, 101.0)
     listed = [Option(engine.choices(scene, photos=(i,)), 0.0, c) for i, c in enumerate(costs)]
     rng = np.random.default_rng(0)
-    drawn = [plan_ladder.random_plan(engine, scene, listed, 100.0, rng) for _ in range(60)]
+    drawn = [program.random_plan(engine, scene, listed, 100.0, rng) for _ in range(60)]
     assert {flops for flops, _ in drawn} == {86.0, 95.0, 100.0}
     assert len({choices.photos for _, choices in drawn}) == CONTEXTS
-    assert plan_ladder.random_plan(engine, scene, listed, 60.0, rng)[0] == 10.0
-    assert plan_ladder.random_plan(engine, scene, listed, 9.0, rng) is None
+    assert program.random_plan(engine, scene, listed, 60.0, rng)[0] == 10.0
+    assert program.random_plan(engine, scene, listed, 9.0, rng) is None
 
 
 def test_generated_frames_of_controls_stand_in_the_middle_or_anywhere(engine, scene):
     wide = types.SimpleNamespace(config=dataclasses.replace(engine.config, frames=17))
     choices = engine.choices(scene, generate=((12, 17),), frames=5)
     rng = np.random.default_rng(0)
-    assert plan_ladder.placed(wide, choices) == ((8, 13),)
-    drawn = {plan_ladder.placed(wide, choices, rng) for _ in range(40)}
+    assert program.placed(wide, choices) == ((8, 13),)
+    drawn = {program.placed(wide, choices, rng) for _ in range(40)}
     assert drawn == {((first, first + 5),) for first in (0, 4, 8, 12)}
-    assert plan_ladder.placed(wide, engine.choices(scene, generate=(None,)), rng) == (None,)
+    assert program.placed(wide, engine.choices(scene, generate=(None,)), rng) == (None,)
 
 
 def test_the_rise_of_the_heads_error_is_found_again():
@@ -290,21 +274,21 @@ def test_the_ladder_makes_affordable_controls_and_rows_that_can_be_summed_up(
 
     whole = engine.choices(scene)
     monkeypatch.setattr(engine, "run", run)
-    unmeasured = functools.partial(plan_ladder.plan, probe=0.0)
-    monkeypatch.setattr(plan_ladder, "plan", unmeasured)
-    monkeypatch.setattr(plan_ladder, "TOLERANCES", (0.02, 0.05, 0.1))
+    unmeasured = functools.partial(program.plan, probe=0.0)
+    monkeypatch.setattr(program, "plan", unmeasured)
+    monkeypatch.setattr(program, "TOLERANCES", (0.02, 0.05, 0.1))
     other = dataclasses.replace(scene, seed=1, photos=bursts(scene.photos))
-    document = json.loads(json.dumps(plan_ladder.climb(engine, [scene, other])))
+    document = json.loads(json.dumps(program.climb(engine, [scene, other])))
     rows = document["rows"]
-    costs = plan_report.points(rows, "planner")[..., 0]
-    assert costs.shape == (2, len(plan_ladder.TOLERANCES)) and len(np.unique(costs)) > 2
-    for name in plan_report.CONTROLS:
-        made = np.isfinite(plan_report.points(rows, name)[..., 0])
-        np.testing.assert_array_equal(plan_report.affordable(rows, name), made)
+    costs = report.points(rows, "planner")[..., 0]
+    assert costs.shape == (2, len(program.TOLERANCES)) and len(np.unique(costs)) > 2
+    for name in report.CONTROLS:
+        made = np.isfinite(report.points(rows, name)[..., 0])
+        np.testing.assert_array_equal(report.affordable(rows, name), made)
         assert made.mean() > 0.5, name
-    summary = plan_report.summarise(rows)
+    summary = report.summarise(rows)
     assert summary["controls"]["random"]["compared"] == costs.size
-    assert all(f"| {name} |" in plan_report.table(summary) for name in plan_report.CONTROLS)
+    assert all(f"| {name} |" in report.table(summary) for name in report.CONTROLS)
 
 
 def bursts(photos):
@@ -331,7 +315,7 @@ def rank_correlation(x, y):
 
 @pytest.fixture(scope="module")
 def stored():
-    return json.loads((ROOT / "experiments" / "results" / "plan_ladder.json").read_text())
+    return harness.read("plan_ladder.json")
 
 
 def test_the_reported_rank_correlation_is_that_of_the_rows(stored):
@@ -353,8 +337,8 @@ def test_errors_are_realised_as_large_as_predicted(stored):
 
 
 def test_the_page_has_the_table_of_the_stored_rows(stored):
-    table = plan_report.table(plan_report.summarise(stored["rows"]))
-    assert table in (ROOT / "docs" / "planning.md").read_text()
+    table = report.table(report.summarise(stored["rows"]))
+    assert table in (harness.DOCS / "planning.md").read_text()
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +351,7 @@ def unseen():
         reference = engine.run(scene, engine.choices(scene))
         found = []
         for tolerance in (0.02, 0.03, 0.04, 0.06, 0.08):
-            made = plan_ladder.plan(
+            made = program.plan(
                 *(engine.params, engine.config, scene.photos, scene.path),
                 tolerance=tolerance,
                 compiled=engine.programs,

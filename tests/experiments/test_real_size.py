@@ -2,20 +2,21 @@
 
 import argparse
 import dataclasses
-import importlib.util
 import json
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
+from experiments.speed import peer, timing
+from experiments.speed import real_size as experiment
+from experiments.speed import rows as parts
 from roge_jax import config as presets
 from roge_jax import cost
 
-EXPERIMENT = Path(__file__).parents[2] / "experiments" / "real_size.py"
 FAKE = """
 import argparse, json, os, pathlib, sys, time
 p = argparse.ArgumentParser()
@@ -38,19 +39,9 @@ pathlib.Path(args.out).write_text(json.dumps(found))
 """
 
 
-@pytest.fixture(scope="module")
-def experiment():
-    spec = importlib.util.spec_from_file_location("real_size", EXPERIMENT)
-    module = importlib.util.module_from_spec(spec)
-    before = list(sys.path)
-    spec.loader.exec_module(module)
-    yield module
-    sys.path[:] = before
-
-
-def test_what_happens_in_a_row_is_said_and_leaves_the_others(experiment, monkeypatch, tmp_path):
+def test_what_happens_in_a_row_is_said_and_leaves_the_others(monkeypatch, tmp_path):
     (tmp_path / "rows.py").write_text(FAKE)
-    monkeypatch.setattr(experiment, "PARTS", tmp_path)
+    monkeypatch.setattr(experiment, "ROW", [str(tmp_path / "rows.py")])
     args = argparse.Namespace(repeats=2)
     expected = {
         "jitted": ("failed", "TypeError: add got incompatible shapes"),
@@ -68,9 +59,7 @@ def test_what_happens_in_a_row_is_said_and_leaves_the_others(experiment, monkeyp
     assert good["status"] == "measured" and good["side"] == "peer" and good["wall_seconds"] > 0
 
 
-def test_rows_table_and_chart(experiment, tmp_path):
-    import rows as parts
-
+def test_rows_table_and_chart(tmp_path):
     rows = parts.rows()
     goals = {name: row for name, row in rows.items() if row.must}
     assert len(goals) == 9, "every line of the goals"
@@ -88,15 +77,15 @@ def test_rows_table_and_chart(experiment, tmp_path):
     json.dumps(found)
     pytest.importorskip("matplotlib")
     experiment.chart(rows, found, tmp_path / "chart.png")
-    assert (tmp_path / "chart.png").stat().st_size > 5000
+    picture = np.asarray(Image.open(tmp_path / "chart.png").convert("RGB"), int)
+    for colour in ((0x40, 0x60, 0xA0), (0xD0, 0x80, 0x30)):  # ours and the peer's bar
+        assert (np.abs(picture - colour).max(-1) < 16).sum() > 500
 
 
 MEASURED = {"status": "measured", "seconds": 0.5, "quartiles": [0.4, 0.6], "tflops": 2.0}
 
 
-def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_path):
-    import rows as parts
-
+def test_an_interrupted_run_continues_side_by_side(monkeypatch, tmp_path):
     one, two, three, unrolled = (
         name for name, row in parts.rows().items() if row.ladder and row.group == "dit"
     )
@@ -158,18 +147,14 @@ def test_an_interrupted_run_continues_side_by_side(experiment, monkeypatch, tmp_
 
 def toy(group: str, **changes):
     """A row of `tiny`, small enough to compile in about a second."""
-    import rows as parts
-
     tiny = dataclasses.replace(presets.preset("tiny"), recon_height=48, recon_width=64)
     return parts.Row(group, tiny, 2, ladder=True, **changes)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16], ids=["float32", "bfloat16"])
 @pytest.mark.parametrize("group", ["dit", "vggt", "rays", "render", "vae"])
-def test_rows_run(experiment, monkeypatch, group, dtype):
+def test_rows_run(monkeypatch, group, dtype):
     """Both types of large matrices: a GPU takes the one that a CPU does not."""
-    import rows as parts
-
     row = toy(group)
     work = parts.job(row, dtype)
     assert all(np.isfinite(x).all() and np.std(x) > 0 for x in jax.tree.leaves(work.call()))
@@ -194,9 +179,7 @@ def test_rows_run(experiment, monkeypatch, group, dtype):
     assert found["tflops"] == pytest.approx(found["flops"] / found["seconds"] / 1e12)
 
 
-def test_a_whole_video_has_the_work_of_all_its_steps(experiment, monkeypatch):
-    import rows as parts
-
+def test_a_whole_video_has_the_work_of_all_its_steps(monkeypatch):
     row, evaluations = toy("sample"), []
 
     def velocity(params, prepared, noise, x, sigma):
@@ -215,16 +198,12 @@ def test_a_whole_video_has_the_work_of_all_its_steps(experiment, monkeypatch):
     assert work.flops == cost.estimate(row.config, row.m, len(evaluations)).total_flops
 
 
-def test_unrolled_blocks_give_the_same(experiment):
-    import rows as parts
-
+def test_unrolled_blocks_give_the_same():
     looped, unrolled = (parts.job(toy("dit", unroll=n), jnp.float32).call() for n in (1, 2))
     np.testing.assert_allclose(looped, unrolled, atol=1e-5)
 
 
-def test_the_look_up_is_counted(experiment):
-    import rows as parts
-
+def test_the_look_up_is_counted():
     mini = presets.preset("mini")
     assert mini.renderer.lookup
     with_it, without = (
@@ -237,10 +216,8 @@ def test_the_look_up_is_counted(experiment):
     )
 
 
-def test_the_difference_of_bfloat16_sees_attention(experiment, monkeypatch):
+def test_the_difference_of_bfloat16_sees_attention(monkeypatch):
     """An attention that is wrong in the fast path alone has to show in every part, as it would not if scores were 0."""
-    import rows as parts
-
     from roge_jax.recon import ray_scene, vggt
     from roge_jax.video import dit
 
@@ -258,9 +235,7 @@ def test_the_difference_of_bfloat16_sees_attention(experiment, monkeypatch):
         assert parts.ours(row, 1, 1.0)["relative_error"] > 3 * right, part
 
 
-def test_a_training_row_takes_the_first_policy_that_fits(experiment, monkeypatch):
-    import rows as parts
-
+def test_a_training_row_takes_the_first_policy_that_fits(monkeypatch):
     tried = []
     gigabytes = {
         "none": 300,
@@ -296,9 +271,7 @@ def test_a_training_row_takes_the_first_policy_that_fits(experiment, monkeypatch
         parts.ours(toy("train", remat="none"), 1, 1.0)
 
 
-def test_clocks_are_read_at_work(experiment, monkeypatch, tmp_path):
-    import timing
-
+def test_clocks_are_read_at_work(monkeypatch, tmp_path):
     calls = []
     monkeypatch.setenv("PATH", str(tmp_path))
     assert timing.busy_clocks(lambda: calls.append(1)) == {} and not calls
@@ -309,10 +282,8 @@ def test_clocks_are_read_at_work(experiment, monkeypatch, tmp_path):
     assert found["clocks.sm"] == "1980 MHz" and found["utilization.gpu"] == "100 %" and calls
 
 
-def test_the_peer_runs_whatever_is_wrong_with_diffusers(experiment, monkeypatch):
+def test_the_peer_runs_whatever_is_wrong_with_diffusers(monkeypatch):
     pytest.importorskip("torch")
-    import peer
-
     monkeypatch.setattr(peer, "diffusers_network", broken)
     found = peer.run(toy("dit"), 1, 5.0)
     assert found["network"] == "plain PyTorch blocks" and found["seconds"] > 0

@@ -1,11 +1,8 @@
 """Disturbances do what they say, run-time measures see them, and warnings come beyond measured limits and not within."""
 
 import dataclasses
-import importlib.util
 import json
-import sys
 import warnings
-from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -15,6 +12,7 @@ import pytest
 from camera_cases import looking_at_origin
 from scene_files import nerfstudio, truth
 
+from experiments.stability import report
 from roge_jax import checkpoint, model, sample
 from roge_jax.config import preset
 from roge_jax.data import faults
@@ -23,8 +21,6 @@ from roge_jax.errors import LimitWarning
 from roge_jax.files import entry
 from roge_jax.geometry.cameras import Cameras, scale_focal
 from roge_jax.sampling import limits, programs
-
-ROOT = Path(__file__).parents[2]
 
 
 def photos(m=3, height=48, width=64, seed=0):
@@ -262,7 +258,7 @@ def without_network(params, views, config, slots):
     """Programs that give grey frames: nothing is compiled."""
     video = np.full((config.frames, config.height, config.width, 3), 0.5, np.float32)
     return programs.Programs(
-        prepare=lambda params, views: SimpleNamespace(shown=video, detail=None),
+        prepare=lambda params, views: SimpleNamespace(shown=video, detail=None, full=None),
         velocity=lambda params, prepared, noise, x, sigma: jnp.zeros_like(x),
         decode=lambda params, x0, detail: video,
     )
@@ -326,20 +322,7 @@ def test_warnings_have_their_own_category():
 # Where curves break.
 
 
-@pytest.fixture(scope="module")
-def report():
-    folder = ROOT / "experiments"
-    spec = importlib.util.spec_from_file_location(
-        "robustness_report", folder / "robustness_report.py"
-    )
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    yield module
-    del sys.modules[spec.name]
-
-
-def test_crossing_is_interpolated(report):
+def test_crossing_is_interpolated():
     levels = np.array([0.0, 1.0, 2.0])
     assert report.crossing(levels, np.array([1.0, 0.5, -0.5])) == pytest.approx(1.5)
     assert np.isnan(report.crossing(levels, np.array([1.0, 0.5, 0.1])))
@@ -349,7 +332,7 @@ def test_crossing_is_interpolated(report):
 
 
 @pytest.mark.parametrize("direction", [1.0, -1.0])
-def test_break_of_a_known_curve_and_its_interval(report, direction):
+def test_break_of_a_known_curve_and_its_interval(direction):
     """Scenes that lose `slope` dB a level: the mean breaks at 1 / mean slope, the interval holds it."""
     slopes = np.random.default_rng(0).uniform(0.3, 0.7, 12)
     steps = np.arange(6.0)
@@ -361,7 +344,7 @@ def test_break_of_a_known_curve_and_its_interval(report, direction):
     assert never["at"] is None and never["interval"] == [None, None]
 
 
-def test_limits_on_estimates_lie_outside_the_undisturbed_scenes(report):
+def test_limits_on_estimates_lie_outside_the_undisturbed_scenes():
     """A break that 5 % of the undisturbed scenes pass moves to their 95 % quantile, above as below; others stay."""
     found, broken = {}, {}
     for kind, measured in report.SHOWN.items():

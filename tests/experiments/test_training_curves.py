@@ -2,14 +2,11 @@
 
 import json
 import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "experiments"))
-
-import training_curves as curves  # noqa: E402
+from experiments import harness
+from experiments.quality import training_curves as curves
 
 
 def test_rows_are_means_and_lose_no_held_out_result(tmp_path):
@@ -31,23 +28,23 @@ def test_rows_are_means_and_lose_no_held_out_result(tmp_path):
 
 
 def test_runs_are_added_behind_the_stored_ones(tmp_path, monkeypatch):
-    monkeypatch.setattr(curves, "RESULTS", tmp_path)
-    monkeypatch.setattr(curves, "draw", lambda runs, file: None)
+    monkeypatch.setattr(harness, "RESULTS", tmp_path)
+    monkeypatch.setattr(curves, "draw", lambda runs: None)
     folder = tmp_path / "lookup"
     folder.mkdir()
     (folder / "log.jsonl").write_text('{"step": 1, "loss": 0.5}\n')
     for words in (["a"], ["--add", "b"], ["c"]):
         monkeypatch.setattr(sys, "argv", ["curves", *words[:-1], f"{words[-1]}={folder}"])
         curves.main()
-        runs = json.loads((tmp_path / "training_curves.json").read_text())["runs"]
+        runs = harness.read("training_curves.json")["runs"]
         assert [run["label"] for run in runs] == {"a": ["a"], "b": ["a", "b"], "c": ["c"]}[
             words[-1]
         ]
 
 
 def test_the_shipped_models_stages_are_there():
-    runs = json.loads((curves.RESULTS / "training_curves.json").read_text())["runs"]
-    recipe = json.loads((ROOT / "roge_jax" / "assets" / "mini" / "config.json").read_text())
+    runs = harness.read("training_curves.json")["runs"]
+    recipe = harness.read(harness.ROOT / "roge_jax" / "assets" / "mini" / "config.json")
     recipe = recipe["provenance"]["recipe"]
     for run in runs:
         assert run["stage"] in recipe and len(run["rows"]) > 10

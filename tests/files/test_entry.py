@@ -369,3 +369,49 @@ class TestRecord:
         with pytest.raises(TypeError):
             write_json(file, {"a": object()})
         assert json.loads(file.read_text()) == content and list(file.parent.iterdir()) == [file]
+
+
+CHECK = "import sys; from roge_jax import check; sys.exit(check.cli(sys.argv[1:]))"
+NO_USER = "import pwd\ndef none(uid): raise KeyError(uid)\npwd.getpwuid = none\n"
+
+
+def checked(tmp_path, folder, code=CHECK, drop=(), **environment):
+    """`check` of a small scene in a process of its own with another environment."""
+    from scene_files import nerfstudio, truth
+
+    place = nerfstudio(tmp_path / folder, truth(2))
+    kept = {k: v for k, v in os.environ.items() if k not in drop} | environment
+    command = [sys.executable, "-c", code, str(place), "--no-matching"]
+    return subprocess.run(command, env=kept, capture_output=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding"),
+    [("\u5199\u771f", "cp1252"), ("caf\udce9", "utf-8:strict"), ("\u00e9", "ascii")],
+)
+def test_names_that_the_terminal_cannot_show_are_escaped(tmp_path, name, encoding):
+    done = checked(tmp_path, name, PYTHONIOENCODING=encoding)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
+    assert b"can be used" in done.stdout and b"\\" in done.stdout
+
+
+def test_a_user_without_a_home_has_no_cache(tmp_path):
+    drop = ("HOME", "ROGE_CACHE", "XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR")
+    done = checked(tmp_path, "scene", NO_USER + CHECK, drop)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("platform", ["cuda", "bogus"])
+@pytest.mark.parametrize("call", ["devices", "default_backend"])
+def test_a_platform_that_is_not_there_is_one_sentence(platform, call):
+    code = (
+        "import argparse\nfrom roge_jax.files import entry\n"
+        f"def main(args):\n    import jax\n    jax.{call}()\n"
+        "entry.run(main, argparse.ArgumentParser(), [])\n"
+    )
+    environment = os.environ | {"JAX_PLATFORMS": platform}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert f"JAX_PLATFORMS={platform}: JAX finds no such device here" in done.stderr

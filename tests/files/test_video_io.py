@@ -158,3 +158,54 @@ class TestPictures:
         assert sheet[60, 300].tolist() == [255, 255, 255]
         blues = [int(sheet[170, 30 + 124 * i, 2]) for i in range(4)]
         assert blues == [0, 6, 13, 19]
+
+
+def lacking(*codecs):
+    """PyAV as built without these encoders."""
+    import av
+
+    opened = av.open
+
+    class Without:
+        def __init__(self, inner):
+            self.inner = inner
+
+        def __enter__(self):
+            self.inner.__enter__()
+            return self
+
+        def __exit__(self, *error):
+            return self.inner.__exit__(*error)
+
+        def __getattr__(self, name):
+            return getattr(self.inner, name)
+
+        def add_stream(self, codec, *rest, **more):
+            if codec in codecs:
+                raise av.codec.codec.UnknownCodecError(codec)
+            return self.inner.add_stream(codec, *rest, **more)
+
+    return lambda *rest, **more: Without(opened(*rest, **more))
+
+
+@pytest.mark.parametrize(
+    ("codecs", "opencv", "name"),
+    [
+        (("libx264",), True, "a.webm"),
+        (("libx264", "libvpx-vp9"), True, "a.webm"),
+        (("libx264", "libvpx-vp9"), False, "a.webp"),
+    ],
+)
+def test_a_missing_codec_costs_no_frames(tmp_path, monkeypatch, codecs, opencv, name):
+    """The next encoder is taken, at last Pillow's; the warning names the file and the codec that is missing."""
+    import av
+
+    monkeypatch.setattr(av, "open", lacking(*codecs))
+    if not opencv:
+        monkeypatch.setitem(sys.modules, "cv2", None)
+    with pytest.warns(UserWarning, match=rf"libx264.* {name} .* is written instead of a\.mp4"):
+        file = video_io.write_video(tmp_path / "a.mp4", waves(4, 48, 80))
+    assert [p.name for p in tmp_path.iterdir()] == [name] and file.name == name
+    monkeypatch.undo()
+    if name.endswith("webm"):
+        assert video_io.read_video(file).shape == (4, 48, 80, 3)

@@ -15,16 +15,15 @@ from roge_jax.geometry.cameras import (
     opencv_to_opengl,
     relative_to,
 )
+from roge_jax.geometry.interpolation import interpolate
 from roge_jax.geometry.rays import project
 from roge_jax.geometry.trajectories import (
     PRESETS,
     focus_distance,
-    load_path,
     make_path,
-    save_path,
     world_up,
 )
-from roge_jax.scenes.paths import interpolate
+from roge_jax.scenes.paths import load_path, save_path
 
 few = settings(max_examples=15, deadline=None)
 CONTEXT = looking_at_origin(5)
@@ -352,7 +351,7 @@ def test_nerfstudio_paths(tmp_path):
     gl = opencv_to_opengl(CONTEXT.c2w)
     entries = [{"camera_to_world": p.ravel().tolist(), "fov": 90.0, "aspect": 1.6} for p in gl]
     content = {"camera_path": entries, "render_height": 24, "render_width": 40, "keyframes": []}
-    path = load_path(write(tmp_path, content))
+    path = load_path(write(tmp_path, content), frame="scene")
     np.testing.assert_allclose(path.c2w, CONTEXT.c2w, atol=1e-12)
     np.testing.assert_allclose(path.K[0], [[12, 0, 20], [0, 12, 12], [0, 0, 1]], atol=1e-9)
     frames = [{"transform_matrix": p.tolist()} for p in gl]

@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import itertools
 import types
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from scene_files import nerfstudio, truth
 
 import roge_jax as rj
+from experiments.planning.runs import CONTEXTS, taken
 from roge_jax import checkpoint, cost, model, sample, sampling
 from roge_jax.config import preset
 from roge_jax.errors import UserError
@@ -402,7 +402,7 @@ def test_targets_keep_their_noise_when_photos_are_dropped(photos, path, monkeypa
             drawn.append((np.asarray(noise), config.slots(0)))
             return 0 * x
 
-        shown = types.SimpleNamespace(shown=video, detail=None)
+        shown = types.SimpleNamespace(shown=video, detail=None, full=None)
         return programs.Programs(lambda *_: shown, velocity, lambda *_: video)
 
     monkeypatch.setattr(programs, "for_window", without_network)
@@ -519,10 +519,7 @@ def test_what_costs_more_than_its_share_is_not_measured(make):
     assert free.planning_cost == 0.0 and list(free.measured) == ["detail"]
 
 
-def test_photos_of_the_ladder_are_spread_or_bursts(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "experiments"))
-    from plan_runs import CONTEXTS, taken
-
+def test_photos_of_the_ladder_are_spread_or_bursts():
     for seed in range(40):
         photos = taken(23, seed)
         gaps = np.diff(photos)

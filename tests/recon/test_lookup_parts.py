@@ -47,10 +47,11 @@ def test_the_choice_of_a_photo_starts_from_one_over_its_distance_squared():
     far = RNG.uniform(0.1, 2.0, (3, H, W, 1))
     seen = np.ones((3, H, W, 1))
     seen[0, :4] = 0.0  # the first photo does not see the upper rows
-    looked, some, about = lookup._chosen(
+    looked, some, about, weights = lookup._chosen(
         SILENT["choose"], *map(jnp.asarray, (found, seen)), ALONE, far, jnp.full((H, W, 3), 0.5)
     )
     share = seen / far**2 / (seen / far**2).sum(0)
+    np.testing.assert_allclose(weights, share, atol=0.02)
     np.testing.assert_allclose(looked, (share * found).sum(0), atol=0.02)
     np.testing.assert_allclose(some, 1.0, atol=0.02)
     spread = (share * np.square(found - (share * found).sum(0))).sum(0).mean(-1)
@@ -62,10 +63,12 @@ def test_photos_enter_the_picture_as_far_as_they_see():
     """Half and half with the RGB head where all of it is seen, its share of that where some is."""
     head, looked = RNG.random((2, H, W, 3))
     some = RNG.random((H, W, 1))
-    mixed = lookup._merged(
+    mixed, gate, rest = lookup._merged(
         SILENT["merge"], *map(jnp.asarray, (head, looked, some, RNG.random((H, W, 3))))
     )
     np.testing.assert_allclose(mixed, head + 0.5 * some * (looked - head), atol=1e-6)
+    np.testing.assert_allclose(gate, 0.5 * some, atol=1e-6)
+    assert not np.any(rest)
 
 
 def test_upsampled_cells_are_means_of_their_neighbours():
@@ -95,7 +98,7 @@ def test_the_coarse_answer_is_the_peak_and_its_neighbours():
     ch, cw = H // lookup.CELL, W // lookup.CELL
     maps = RNG.random((1, ch, cw, lookup.MATCHED + 3)).astype(np.float32)
     prior = 3.0 * RNG.standard_normal((ch, cw, CUTS)).astype(np.float32)
-    colours, cut, mass, _ = lookup._coarse(
+    logits, colours, cut, mass, _ = lookup._coarse(
         SILENT,
         jnp.asarray(maps),
         jnp.eye(1),
@@ -108,6 +111,7 @@ def test_the_coarse_answer_is_the_peak_and_its_neighbours():
     )
     share, numbers = softmax(prior.astype(np.float64), -1), np.arange(CUTS)
     about = share * (np.abs(numbers - prior.argmax(-1)[..., None]) <= 2)
+    np.testing.assert_allclose(np.moveaxis(logits, 0, -1), prior, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(mass, about.sum(-1), rtol=1e-4)
     np.testing.assert_allclose(cut, (about * numbers).sum(-1) / about.sum(-1), rtol=1e-4)
     np.testing.assert_allclose(colours, maps[0, ..., lookup.MATCHED :], atol=2e-3)

@@ -1,9 +1,7 @@
 """Wrong poses, wrong focal lengths and JPEG are seen in the photos of a scene, said once, and do not stop a run; other axes do."""
 
 import dataclasses
-import importlib
 import json
-import sys
 from pathlib import Path
 
 import cv2
@@ -13,6 +11,7 @@ import pytest
 import scene_files as files
 from test_robustness import without_network
 
+from experiments.stability import matching as measured
 from roge_jax import checkpoint, model, sample
 from roge_jax.config import preset
 from roge_jax.core.params import abstract
@@ -368,17 +367,7 @@ def test_python_users_get_the_same(scene, monkeypatch):
 # How the limits are measured.
 
 
-@pytest.fixture(scope="module")
-def measured():
-    folder = Path(__file__).parents[2] / "experiments"
-    sys.path.insert(0, str(folder))
-    yield importlib.import_module("robustness_matching")
-    sys.path.remove(str(folder))
-    for name in ("robustness_matching", "robustness_report"):
-        sys.modules.pop(name, None)
-
-
-def test_exact_matches_show_what_a_wrong_pose_does_and_no_more(measured):
+def test_exact_matches_show_what_a_wrong_pose_does_and_no_more():
     """A wall at z = 5: seen from all sides of it, without hidden parts; one camera sees none of it."""
     cameras = small(around())
     y, x = np.mgrid[: SIZE[0], : SIZE[1]] + 0.5
@@ -398,7 +387,7 @@ def test_exact_matches_show_what_a_wrong_pose_does_and_no_more(measured):
     assert pixels[1] == pytest.approx(2 * pixels[0], rel=0.05) and pixels[0] > 0.005
 
 
-def test_limits_on_poses_are_the_smaller_pixels_and_lie_outside_the_noise(measured):
+def test_limits_on_poses_are_the_smaller_pixels_and_lie_outside_the_noise():
     ends = {"rotation": 0.2, "position": 0.01, "focal": 0.6}
     breaks = {
         knob: {

@@ -21,7 +21,7 @@ from roge_jax.geometry.cameras import (
 )
 from roge_jax.geometry.crops import crop_resize_K, resize, scale_K, turn
 from roge_jax.geometry.rays import plucker_float64
-from roge_jax.scenes.images import _upright, read_image
+from roge_jax.scenes.images import _upright, read_header, read_image
 from roge_jax.scenes.scene import Scene, load_scene, prepare
 
 
@@ -274,3 +274,65 @@ def test_shrinking_averages_what_it_leaves_out(monkeypatch, filter_of):
         for size in ((20, 27), (15, 20), (7, 16)):
             inner = resize(image, *size)[1:-1, 1:-1]
             assert np.abs(inner - 0.5).max() < 0.17
+
+
+FORMATS = {
+    "png": {},
+    "jpg": {"quality": 100, "subsampling": 0},
+    "webp": {"lossless": True},
+    "tif": {},
+    "tif lzw": {"compression": "tiff_lzw"},
+    "tif deflate": {"compression": "tiff_adobe_deflate"},
+    "tif big": {"big_tiff": True},
+}
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("name", FORMATS)
+def test_orientation_is_applied_once(tmp_path, name, orientation):
+    """Every tag in every format, both ways of `exif`: the upright picture, or the stored grid; the header says its size."""
+    from PIL import Image
+
+    upright = np.repeat(np.repeat(picture(0, 6, 10), 8, 0), 8, 1)
+    stored, exif = stored_with_tag(upright, orientation)
+    file = tmp_path / f"a.{name.partition(' ')[0]}"
+    tiff = name.startswith("tif")
+    tags = {"tiffinfo": {274: orientation}} if tiff else {"exif": exif}
+    Image.fromarray(stored).save(file, **tags, **FORMATS[name])
+    tolerance = 0.03 if name == "jpg" else 1e-6
+    np.testing.assert_allclose(read_image(file), upright / np.float32(255), atol=tolerance)
+    np.testing.assert_allclose(
+        read_image(file, exif=False), stored / np.float32(255), atol=tolerance
+    )
+    header = read_header(file)
+    assert (header.stored, header.displayed) == (stored.shape[:2], upright.shape[:2])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_orientation_of_sixteen_bits(tmp_path, orientation, order):
+    """Deep TIFFs in both byte orders: other decoders turn eight bits and not sixteen."""
+    import tifffile
+
+    upright = picture(0).astype(np.uint16) * 257
+    stored, _ = stored_with_tag(upright, orientation)
+    file = tmp_path / "a.tif"
+    tag = (274, "H", 1, orientation, True)
+    tifffile.imwrite(file, stored, photometric="rgb", byteorder=order, extratags=[tag])
+    np.testing.assert_allclose(read_image(file), upright / np.float32(65535), atol=1e-6)
+    np.testing.assert_allclose(read_image(file, exif=False), stored / np.float32(65535), atol=1e-6)
+
+
+def test_heic_by_an_extra(tmp_path, monkeypatch):
+    """An iPhone's own format with pillow-heif, and one sentence without."""
+    pillow_heif = pytest.importorskip("pillow_heif")
+    from PIL import Image
+
+    flat = np.full((48, 64, 3), (200, 60, 30), np.uint8)
+    pillow_heif.from_pillow(Image.fromarray(flat)).save(tmp_path / "a.heic", quality=95)
+    pixels = read_image(tmp_path / "a.heic")
+    assert pixels.shape == (48, 64, 3)
+    np.testing.assert_allclose(pixels * 255, flat, atol=6)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    with pytest.raises(UserError, match=r"a.heic: HEIC needs the package pillow-heif"):
+        read_image(tmp_path / "a.heic")

@@ -60,7 +60,7 @@ def colmap(folder: Path, cameras: Cameras, binary: bool) -> Path:
     for view, name in enumerate(names):
         save(folder / "images" / name, picture(view))
     parameters = np.stack([list(intrinsic_fields(K).values()) for K in cameras.K])
-    order = [2, 0, 3, 1][: len(names)]  # the reader must sort by name
+    order = [i for i in (2, 0, 3, 1) if i < len(names)]  # the reader must sort by name
     if not binary:
         lines = ["# Camera list"]
         for view, numbers in enumerate(parameters):

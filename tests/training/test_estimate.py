@@ -1,14 +1,14 @@
 """What a step costs before it runs, against XLA's own memory analysis and against counts made by hand."""
 
 import dataclasses
-import importlib.util
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 from test_sharding import small
 
+from experiments.scaling import memory_check
+from experiments.speed import train_profile
 from roge_jax import checkpoint, config, model, train
 from roge_jax.core import params, program, sharding
 from roge_jax.core.attention import as_on_gpu, attention, is_attention
@@ -126,11 +126,7 @@ def lora(cfg, **changes):
 @pytest.mark.parametrize("name", ["tiny", "mini"])
 def test_a_whole_step_takes_what_xla_says(name):
     """All bytes of a device (weights, optimiser, batch, activations) of a LoRA step, operations in one order."""
-    path = Path(__file__).parents[2] / "experiments" / "memory_check.py"
-    spec = importlib.util.spec_from_file_location("memory_check", path)
-    experiment = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(experiment)
-    found = experiment.child(f"{name},dots,in-order")
+    found = memory_check.child(f"{name},dots,in-order")
     held = sum(n for part, n in found["planned"].items() if not part.startswith("activations"))
     # Exact, but for the random key that XLA counts as well.
     assert 0 <= found["arguments"] - held <= 64
@@ -284,11 +280,6 @@ class TestProgramOfTraining:
 
 @pytest.mark.slow
 def test_a_steps_time_is_split_into_the_parts_that_it_runs(tmp_path):
-    spec = importlib.util.spec_from_file_location(
-        "train_profile", Path(__file__).parents[2] / "experiments/train_profile.py"
-    )
-    profile = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(profile)
     cfg = config.preset("tiny")
     cfg = dataclasses.replace(
         cfg,
@@ -296,7 +287,7 @@ def test_a_steps_time_is_split_into_the_parts_that_it_runs(tmp_path):
         renderer=dataclasses.replace(cfg.renderer, lookup=8),
     )
     checkpoint.save_model(tmp_path / "model", model.init(jax.random.key(0), cfg), cfg)
-    found = profile.profile(str(tmp_path / "model"), photos=2, repeats=1, seed=0)
+    found = train_profile.profile(str(tmp_path / "model"), "48x64", photos=2, repeats=1, seed=0)
     shares = found["share_of_step"]
     parts = ["VAE encode", "reconstruction", "ray queries", "picture", "transformer"]
     assert list(shares) == [*parts, "unattributed", "backward", "optimiser"]

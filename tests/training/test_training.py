@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import os
 import random
 import signal
 import subprocess
@@ -505,7 +506,7 @@ def kill_soon_after_a_checkpoint(out, rng):
     code = f"import test_training; test_training.train_slowly({str(out)!r})"
     with subprocess.Popen(
         [sys.executable, "-c", "import conftest; " + code],
-        cwd=Path(__file__).parent,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         stderr=subprocess.PIPE,
     ) as process:
         deadline = time.monotonic() + 300

@@ -1,0 +1,1 @@
+"""What the planner spends and loses, from an empty room to clutter."""

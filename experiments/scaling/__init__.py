@@ -1,0 +1,1 @@
+"""Memory, communication and work of training, counted and compared with XLA's."""

@@ -1,0 +1,1 @@
+"""What the model and its training stand, and where they break."""

@@ -1,0 +1,123 @@
+"""Which cut of a ray is right, from all of a view's rays together: semi-global aggregation of what photos and network say.
+
+The look-up decides cell by cell (`recon.lookup`), and where neighbours disagree its cuts jump from pixel to pixel. Here
+every pixel has a cost for each cut, how much the photos differ there less what the network believes, and cuts of
+neighbours that differ cost as well (Hirschmueller 2008, four directions). Nothing in here is trained.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+DIFFERENCE = 0.05  # difference of colours that counts as another thing
+STRUCTURE = 0.05  # weight of the normalised luma's difference beside colours
+RADIUS = 3  # pixels about which luma is normalised
+WINDOW = 2  # pixels about which costs are averaged
+BELIEF = 0.1  # cost of a factor e in the network's probability
+LEAST = -12.0  # its logarithm is not taken for less
+HIDDEN = 1.0  # further cost of cuts that no photo sees
+STEP, JUMP = 0.04, 0.3  # cost of a neighbour one cut, and more than one cut, away
+TOGETHER = 1.5  # cuts by which neighbours on one surface differ at most
+
+
+def with_structure(photos: jax.Array) -> jax.Array:
+    """Photos [m, h, w, 3] with a fourth channel: luma less its mean around, over its deviation there."""
+    luma = photos @ jnp.asarray([0.299, 0.587, 0.114])
+    mean = box(luma, RADIUS)
+    deviation = jnp.sqrt(jnp.maximum(box(jnp.square(luma), RADIUS) - jnp.square(mean), 0.0) + 1e-4)
+    return jnp.concatenate([photos, ((luma - mean) / deviation)[..., None]], -1)
+
+
+def box(x: jax.Array, radius: int) -> jax.Array:
+    """Means over windows of 2 radius + 1 pixels a side along the last two axes, border repeated."""
+    side = 2 * radius + 1
+    x = jnp.pad(x, [(0, 0)] * (x.ndim - 2) + [(radius, radius)] * 2, mode="edge")
+    for axis in (x.ndim - 2, x.ndim - 1):
+        n = x.shape[axis] - side + 1
+        parts = [jax.lax.slice_in_dim(x, i, i + n, axis=axis) for i in range(side)]
+        x = jnp.stack(parts).mean(0)
+    return x
+
+
+def difference(values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Array:
+    """How much the photos differ at cuts [k, p]: values [m, k, p, 4] of `with_structure`, seen [m, k, p].
+
+    A soft minimum over pairs of photos from different places (`alike`: `sweep.twins`), since one of a pair may look at
+    something in front. Where no pair sees a cut, half of what strangers cost.
+    """
+    close, pairs = jnp.zeros(seen.shape[1:]), jnp.zeros(seen.shape[1:])
+    for i in range(len(values)):
+        for j in range(i):
+            change = jnp.abs(values[i] - values[j])
+            cost = change[..., :3].mean(-1) + STRUCTURE * jnp.minimum(change[..., 3], 2.0)
+            both = seen[i] * seen[j] * (1.0 - alike[i, j])
+            close += both * jnp.exp(-cost / DIFFERENCE)
+            pairs += both
+    most = -DIFFERENCE * float(np.log(1e-4))
+    cost = -DIFFERENCE * jnp.log(close / jnp.maximum(pairs, 1e-6) + 1e-4)
+    return jnp.where(pairs > 0.5, cost, 0.5 * most)
+
+
+def semi_global(cost: jax.Array) -> jax.Array:
+    """Costs [k, h, w] of cuts with those of the neighbours along both axes, both ways."""
+
+    def along(cost: jax.Array, reverse: bool) -> jax.Array:
+        def step(before, own):
+            least = before.min(0, keepdims=True)
+            far = jnp.full_like(least, 1e9)
+            near = jnp.minimum(
+                jnp.concatenate([before[1:], far]), jnp.concatenate([far, before[:-1]])
+            )
+            total = own + jnp.minimum(jnp.minimum(before, near + STEP), least + JUMP) - least
+            return total, total
+
+        rows = jnp.moveaxis(cost, -1, 0)
+        _, total = jax.lax.scan(step, jnp.zeros_like(rows[0]), rows, reverse=reverse)
+        return jnp.moveaxis(total, 0, -1)
+
+    turned = jnp.swapaxes(cost, 1, 2)
+    down = along(turned, False) + along(turned, True)
+    return (along(cost, False) + along(cost, True) + jnp.swapaxes(down, 1, 2)) / 4
+
+
+def cheapest(cost: jax.Array) -> jax.Array:
+    """The cut [h, w] of least cost [k, h, w], between cuts by a parabola."""
+    k, most = jnp.argmin(cost, 0), len(cost) - 1
+
+    def at(step: int) -> jax.Array:
+        return jnp.take_along_axis(cost, jnp.clip(k + step, 0, most)[None], 0)[0]
+
+    before, own, after = at(-1), at(0), at(1)
+    bend = before - 2.0 * own + after
+    step = jnp.clip(0.5 * (before - after) / jnp.maximum(bend, 1e-6), -0.5, 0.5)
+    return k + jnp.where((k > 0) & (k < most) & (bend > 1e-6), step, 0.0)
+
+
+def settled(
+    values: jax.Array, seen: jax.Array, alike: jax.Array, belief: jax.Array, h: int, w: int
+) -> jax.Array:
+    """The cut of every pixel [h, w]: values [m, k, h w, 4] of `with_structure` at all cuts, seen [m, k, h w], and the
+    network's logits over the cuts of cells `belief` [k, ch, cw]."""
+    size = (len(belief), h, w)
+    cost = box(difference(values, seen, alike).reshape(size), WINDOW)
+    believed = jax.image.resize(jax.nn.log_softmax(belief, 0), size, "linear")
+    cost = cost - BELIEF * jnp.maximum(believed, LEAST)
+    return cheapest(semi_global(cost + HIDDEN * (seen.max(0).reshape(size) <= 0)))
+
+
+def enlarged(cut: jax.Array, height: int, width: int) -> jax.Array:
+    """Cuts [h, w] at [height, width]: bilinear on a surface, and from one of its sides at an edge, never between."""
+    h, w = cut.shape
+    places, shares = [], []
+    for size, small in ((height, h), (width, w)):
+        at = np.clip((np.arange(size) + 0.5) * small / size - 0.5, 0.0, small - 1.0)
+        low = np.minimum(at.astype(int), max(small - 2, 0))
+        places.append((low, np.minimum(low + 1, small - 1)))
+        shares.append((1.0 - (at - low), at - low))
+    four = [(i, j) for i in (0, 1) for j in (0, 1)]
+    share = np.stack([shares[0][i][:, None] * shares[1][j][None] for i, j in four])
+    values = jnp.stack([cut[places[0][i]][:, places[1][j]] for i, j in four])
+    nearest = np.eye(4, dtype=np.float32)[share.argmax(0)].transpose(2, 0, 1)
+    own = (nearest * values).sum(0, keepdims=True)
+    share = share.astype(np.float32) * (jnp.abs(values - own) < TOGETHER)
+    return (share * values).sum(0) / share.sum(0)

@@ -1,0 +1,134 @@
+"""Image-based rendering at any size: the photos' own pixels at the cut that a view's rays agree on.
+
+Cut, blending weights and trust are found at the model's size (`recon.lookup`); colours are read here, from photos as fine
+as they are given, so a picture is as sharp as they are. Where photos are finer than the picture they are read from a
+level of a pyramid that is not (Williams 1983).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from .aggregate import enlarged
+from .sweep import (
+    EPS,
+    Motion,
+    bilinear,
+    in_pixels_of,
+    inverse_depth,
+    meet_at,
+    pixels_of,
+    texels,
+)
+
+LEVELS = (
+    3  # of the pyramid: photos up to four times finer than the picture are read without aliasing
+)
+DISAGREED = 0.05  # difference of the photos' colours at which half of the picture is not theirs
+FADE = 0.1  # weight of all photos below which they fade out
+
+
+class Blend(NamedTuple):
+    """What a view takes from the photos, at the model's size."""
+
+    cut: jax.Array  # [v, h, w]
+    reach: jax.Array  # [v], see `sweep.shared_reach`
+    share: jax.Array  # [v, m, h, w, 1] of each photo
+    gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
+    head: jax.Array  # [v, h, w, 3] the RGB head's picture
+    rest: jax.Array  # [v, h, w, 3] what the mixture adds to both
+
+
+class Pyramid(NamedTuple):
+    """Photos of one size at several levels, as rows to read from."""
+
+    rows: jax.Array  # [all levels' texels, 12], see `sweep.texels`
+    height: jax.Array  # [levels] float32
+    width: jax.Array  # [levels]
+    first: jax.Array  # [levels, m] row of each photo
+
+    @classmethod
+    def of(cls, photos: jax.Array) -> "Pyramid":
+        """The pyramid of photos [m, h, w, 3], each level half as large as the one before."""
+        m, h, w, _ = photos.shape
+        sizes, rows, first, total = [], [], [], 0
+        for level in range(LEVELS):
+            size = (max(2, h >> level), max(2, w >> level))
+            small = jax.image.resize(photos, (m, *size, 3), "linear", antialias=True)
+            rows.append(texels(small))
+            count = (size[0] - 1) * (size[1] - 1)
+            first.append([total + i * count for i in range(m)])
+            total += m * count
+            sizes.append(size)
+        height, width = (jnp.asarray(side, jnp.float32) for side in zip(*sizes, strict=True))
+        return cls(jnp.concatenate(rows), height, width, jnp.asarray(first, jnp.int32))
+
+    def read(self, x: jax.Array, y: jax.Array, level: jax.Array) -> jax.Array:
+        """Colours [m, p, 3] at (x, y) [m, p] in pixels of level 0, between the two levels about `level`."""
+        photo = jnp.broadcast_to(jnp.arange(self.first.shape[1])[:, None], level.shape)
+        low = jnp.clip(jnp.floor(level), 0, LEVELS - 1)
+        found = []
+        for k in (low, jnp.minimum(low + 1, LEVELS - 1)):
+            k = k.astype(jnp.int32)
+            h, w = self.height[k], self.width[k]
+            at = x * w / self.width[0], y * h / self.height[0]
+            found.append(bilinear(self.rows, *at, (h, w), self.first[k, photo]))
+        share = jnp.clip(level - low, 0.0, 1.0)[..., None]
+        return found[0] + share * (found[1] - found[0])
+
+
+@jax.named_scope("render")
+def render(
+    photos: jax.Array,
+    way: Motion,
+    blend: Blend,
+    scale: jax.Array,
+    *,
+    cuts: int,
+    height: int,
+    width: int,
+) -> jax.Array:
+    """Pictures [v, height, width, 3] in [0, 1] of v views.
+
+    Args:
+      photos: [m, ph, pw, 3] in [0, 1], of any size.
+      way: motion from the views to the photos in pixels of the model's size.
+      blend: at the model's size h x w, with leading axis v.
+      scale: [v, m] focal length of the photo over that of the view, in pixels of the model's size.
+    """
+    pyramid = Pyramid.of(photos)
+    size = photos.shape[1:3]
+
+    def one(view):
+        return _render(pyramid, size, *view, cuts, height, width)
+
+    return jax.lax.map(one, (way, blend, scale))
+
+
+def _render(pyramid: Pyramid, size, way: Motion, blend: Blend, scale, cuts, height, width):
+    h, w = blend.cut.shape
+    where = pixels_of(height, width, (h / height, w / width))
+    way = in_pixels_of(way, (h / size[0], w / size[1]))
+    cut = enlarged(blend.cut, height, width)
+    inverse = inverse_depth(cut.reshape(1, -1), cuts, blend.reach)
+    x, y, depth, seen = (found[:, 0] for found in meet_at(way, where, inverse, size))
+    finer = jnp.sqrt(size[0] * size[1] / (height * width)) * scale[:, None] / depth
+    colours = pyramid.read(x, y, jnp.log2(jnp.maximum(finer, 1e-6)))
+    m = len(colours)
+    colours, seen = colours.reshape(m, height, width, 3), seen.reshape(m, height, width, 1)
+
+    share = _resized(blend.share, height, width) * seen
+    weight = share.sum(0)
+    photos = (share * colours).sum(0) / jnp.maximum(weight, EPS)  # [height, width, 3]
+    head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
+    mixed = head + rest + gate * (photos - head)
+    # The mixture is cautious. Where the photos agree with one another they are taken as they are.
+    apart = (share * jnp.abs(colours - photos[None])).sum(0).mean(-1, keepdims=True)
+    apart = _resized(_resized(apart / jnp.maximum(weight, EPS), h, w), height, width)
+    trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * jnp.clip(weight / FADE, 0.0, 1.0)
+    return jnp.clip(mixed + trust * (photos - mixed), 0.0, 1.0)
+
+
+def _resized(x: jax.Array, height: int, width: int) -> jax.Array:
+    return jax.image.resize(x, (*x.shape[:-3], height, width, x.shape[-1]), "linear")

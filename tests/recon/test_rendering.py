@@ -1,0 +1,202 @@
+"""Image-based rendering at output size: aggregation of the cuts' costs, pyramids of photos, and the picture they make."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_lookup import CUTS, RNG, D, H, W, init, side_by_side, textured_plane
+
+from roge_jax.recon import aggregate, lookup, rendering, sweep
+
+ALONE = jnp.eye(2)
+
+
+def dynamic_programming(cost: np.ndarray) -> float:
+    """The least sum of own costs and of steps between neighbours in a row [k, w], by trying everything one by one."""
+    total = cost[:, 0].astype(float)
+    k = np.arange(len(cost))
+    apart = np.abs(k[:, None] - k[None])
+    steps = np.where(apart == 0, 0.0, np.where(apart == 1, aggregate.STEP, aggregate.JUMP))
+    for own in cost[:, 1:].T:
+        total = own + (total[None] + steps).min(1)
+    return float(total.min())
+
+
+def test_semi_global_costs_are_those_of_the_best_path():
+    """Along a single row both ways meet: at every pixel the two sums less its own cost are the best path through it."""
+    cost = RNG.random((6, 1, 9))
+    both = 4.0 * np.asarray(
+        aggregate.semi_global(jnp.asarray(cost))
+    )  # up and down see themselves alone
+    along = both[:, 0] - 2.0 * cost[:, 0]
+    through = along - cost[:, 0]  # each way subtracts the least cost before it
+    best = dynamic_programming(cost[:, 0])
+    path = through.min(0)
+    # The normalisers differ from pixel to pixel; the cut that the best path takes does not.
+    for x in range(9):
+        kept = cost[:, 0].copy()
+        forced = []
+        for k in range(6):
+            alone = kept.copy()
+            alone[np.arange(6) != k, x] += 1e6
+            forced.append(dynamic_programming(alone))
+        np.testing.assert_allclose(through[:, x] - path[x], np.array(forced) - best, atol=1e-5)
+
+
+def test_a_lone_outlier_follows_its_neighbours_and_an_edge_stays():
+    cost = np.full((8, 12, 16), 0.2, np.float32)
+    truth = np.where(np.arange(16) < 8, 2, 6)[None].repeat(12, 0)
+    np.put_along_axis(cost, truth[None], 0.0, 0)
+    cost[:, 5, 3] = 0.2
+    cost[7, 5, 3] = 0.15  # wrong by itself
+    cut = np.asarray(aggregate.cheapest(aggregate.semi_global(jnp.asarray(cost))))
+    np.testing.assert_allclose(cut, truth, atol=0.05)
+
+
+def test_the_cut_between_cuts_is_a_parabola_s():
+    k, least = np.arange(7.0), 3.3
+    cost = np.square(k - least)[:, None, None]
+    assert float(aggregate.cheapest(jnp.asarray(cost))[0, 0]) == pytest.approx(least, abs=1e-5)
+    for end in (0.0, 6.0):  # no parabola at the ends
+        cost = np.abs(k - end)[:, None, None]
+        assert float(aggregate.cheapest(jnp.asarray(cost))[0, 0]) == end
+
+
+def test_one_pair_that_agrees_is_enough_and_strangers_are_not():
+    """A photo with something in front does not raise the cost that the two others agree on."""
+    values = np.zeros((3, 4, 1, 4))
+    values[:, 1] = RNG.random((3, 1, 4))  # three strangers
+    values[2, 2] = 0.8  # two agree, one is occluded
+    seen = np.ones((3, 4, 1))
+    seen[1:, 3] = 0.0  # one alone
+    cost = np.asarray(aggregate.difference(*map(jnp.asarray, (values, seen)), jnp.eye(3)))[:, 0]
+    assert cost[0] < 1e-3 and cost[2] < 0.07 < cost[1]
+    assert cost[3] == pytest.approx(-0.5 * aggregate.DIFFERENCE * np.log(1e-4), rel=1e-4)
+    twins = jnp.ones((3, 3))  # from one place they are no witnesses of each other
+    alone = np.asarray(aggregate.difference(*map(jnp.asarray, (values, seen)), twins))[:, 0]
+    np.testing.assert_allclose(alone, cost[3], rtol=1e-4)
+
+
+def test_enlarged_cuts_never_lie_between_two_surfaces():
+    cut = np.full((6, 8), 3.0)
+    cut[:, 4:] = 11.0
+    cut[2, 1] = 4.0  # a slope on one surface is interpolated
+    big = np.asarray(aggregate.enlarged(jnp.asarray(cut), 18, 24)).round(4)
+    assert big.shape == (18, 24)
+    assert np.all((big <= 4.0) | (big == 11.0)) and np.any((big > 3.0) & (big < 4.0))
+    assert np.all(big[:, :11] <= 4.0) and np.all(big[:, 13:] == 11.0)
+    same = aggregate.enlarged(jnp.asarray(cut), 6, 8)
+    np.testing.assert_allclose(same, cut)
+
+
+def test_a_pyramid_gives_means_of_what_is_finer():
+    photos = RNG.random((2, 16, 24, 3)).astype(np.float32)
+    pyramid = rendering.Pyramid.of(jnp.asarray(photos))
+    y, x = np.mgrid[2:14, 2:22] + 0.5
+    x, y = (np.tile(z.reshape(1, -1), (2, 1)).astype(np.float32) for z in (x, y))
+    read = functools.partial(pyramid.read, *map(jnp.asarray, (x, y)))
+    sharp, half, quarter = (np.asarray(read(jnp.full(x.shape, k))) for k in (-3.0, 1.0, 9.0))
+    np.testing.assert_allclose(sharp, photos[:, 2:14, 2:22].reshape(2, -1, 3), atol=1e-5)
+    small = jax.image.resize(photos, (2, 8, 12, 3), "linear", antialias=True)
+    np.testing.assert_allclose(
+        half[:, [21]],
+        small[:, [1], 1] * 0.5625
+        + small[:, [1], 2] * 0.1875
+        + small[:, [2], 1] * 0.1875
+        + small[:, [2], 2] * 0.0625,
+        atol=1e-5,
+    )
+    assert np.std(quarter) < np.std(half) < 0.5 * np.std(sharp)
+    between = np.asarray(read(jnp.full(x.shape, 0.25)))
+    np.testing.assert_allclose(between, 0.75 * sharp + 0.25 * half, atol=1e-5)
+
+
+def plane(size: int):
+    """A view and the two photos beside it of a textured plane: the view's picture at `size` times H x W, photos likewise,
+    cameras at H x W, and the blend that knows the depth."""
+    K, c2w = side_by_side(3, 0.15)
+    order = [1, 0, 2]
+    K, c2w = K[order], c2w[order]
+    cut = 8
+    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(cut), CUTS))
+    scaled = K * np.array([size, size, 1.0], np.float32)[:, None]
+    pictures = textured_plane(scaled, c2w, depth, size * H, size * W, 1.0 * size)
+    blend = rendering.Blend(
+        cut=jnp.full((1, H, W), float(cut)),
+        reach=jnp.ones(1),
+        share=jnp.full((1, 2, H, W, 1), 0.5),
+        gate=jnp.full((1, H, W, 1), 0.5),
+        head=jnp.full((1, H, W, 3), 0.5),
+        rest=jnp.zeros((1, H, W, 3)),
+    )
+    way = sweep.motion(K[:1], c2w[:1], K[1:], c2w[1:])
+    return pictures, way, blend
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_a_known_surface_is_as_sharp_as_its_photos(size):
+    pictures, way, blend = plane(size)
+    scale = jnp.ones((1, 2))
+    shown = rendering.render(
+        jnp.asarray(pictures[1:]), way, blend, scale, cuts=CUTS, height=size * H, width=size * W
+    )
+    middle = np.s_[2 * size : -2 * size, 8 * size : -8 * size]
+    off = np.abs(np.asarray(shown[0]) - pictures[0])[middle]
+    assert off.mean() < 0.02, off.mean()
+    if size > 1:  # which a picture of the model's size, enlarged, is not
+        small = np.asarray(pictures[0]).reshape(H, size, W, size, 3).mean((1, 3))
+        blurred = np.abs(small.repeat(size, 0).repeat(size, 1) - pictures[0])[middle]
+        assert off.mean() < 0.5 * blurred.mean()
+
+
+def test_where_no_photo_sees_anything_the_mixture_stays():
+    pictures, way, blend = plane(1)
+    away = sweep.Motion(-way.turn, -way.shift)  # everything lies behind the photos
+    shown = rendering.render(
+        jnp.asarray(pictures[1:]),
+        away,
+        blend,
+        jnp.ones((1, 2)),
+        cuts=CUTS,
+        height=2 * H,
+        width=2 * W,
+    )
+    np.testing.assert_allclose(np.asarray(shown), 0.25, atol=1e-6)  # 0.5 + 0.5 (0 - 0.5)
+
+
+def test_photos_that_disagree_leave_the_picture_to_the_mixture():
+    pictures, way, blend = plane(1)
+    photos = np.stack([np.zeros_like(pictures[1]), np.ones_like(pictures[2])])
+    shown = rendering.render(
+        jnp.asarray(photos), way, blend, jnp.ones((1, 2)), cuts=CUTS, height=H, width=W
+    )
+    middle = np.asarray(shown)[0, 2:-2, 18:-18]
+    np.testing.assert_allclose(middle, 0.5, atol=0.02)
+
+
+def test_look_up_gives_the_picture_at_both_sizes():
+    """The larger picture shows what the smaller one shows, and asking for it changes nothing of that."""
+    p = init(jax.random.key(1), lookup.lookup_specs(D, 8, CUTS))
+    K, c2w = side_by_side(3, 0.15)
+    order = [1, 0, 2]
+    K, c2w = K[order], c2w[order]
+    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(8), CUTS))
+    big = textured_plane(K * np.array([3, 3, 1.0], np.float32)[:, None], c2w, depth, 3 * H, 3 * W)
+    photos = big.reshape(3, H, 3, W, 3, 3).mean((2, 4))
+    features = RNG.standard_normal((1, H // 8, W // 8, D)).astype(np.float32)
+    head = jnp.full((1, H, W, 3), 0.5)
+    given = (p, features, head, jnp.asarray(photos[1:]), (K[:1], c2w[:1]), (K[1:], c2w[1:]))
+    full = lookup.Full(jnp.asarray(big[1:]), 3 * H, 3 * W)
+    both = jax.jit(
+        lambda *a, photos: lookup.look_up(*a, cuts=CUTS, full=full._replace(photos=photos))
+    )(*given, photos=full.photos)
+    alone = jax.jit(functools.partial(lookup.look_up, cuts=CUTS))(*given)
+    assert alone.full is None and both.full.shape == (1, 3 * H, 3 * W, 3)
+    for a, b in zip(alone[:4], both[:4]):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    middle = np.s_[:, 6:-6, 24:-24]
+    off = np.abs(np.asarray(both.full[0]) - big[0])[middle[1:]]
+    head_off = np.abs(0.5 - big[0])[middle[1:]]
+    assert off.mean() < 0.5 * head_off.mean()
