@@ -262,7 +262,7 @@ def sample(
             video = np.asarray(run.decode(params, x0, prepared.detail))[: last - first]
             low = np.asarray(prepared.shown)[: last - first]
             frame, preview = _shown((prepared.shown, prepared.full), last - first, config)
-            frames.append(_at_output(video, low, frame, config))
+            frames.append(at_output(video, low, frame, config))
             previews.append(preview)
             if picture is not None:
                 frame, preview = _shown(picture, len(shown), config)
@@ -293,7 +293,7 @@ def _shown(made, count: int, config: RoGeConfig) -> tuple[np.ndarray, np.ndarray
     return _enlarged(shown, *config.output_size), shown
 
 
-def _at_output(
+def at_output(
     video: np.ndarray, low: np.ndarray, full: np.ndarray, config: RoGeConfig
 ) -> np.ndarray:
     """A generated video [n, h, w, 3] at the output's size: what the generator changed of the reconstruction's picture
