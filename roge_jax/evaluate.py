@@ -174,12 +174,13 @@ class Evaluator:
 
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
         """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, at the model's size or,
-        of models that read colours from the photos, at the output size, from the photos of that size.
+        of models that read colours from the photos, at the output size, from the whole photos.
         """
         from .data.views import make_sample
         from .geometry.cameras import Cameras
         from .geometry.packing import pad_path
         from .sampling.video import at_output
+        from .sampling.whole import whole
 
         m, n, frames = len(scene["context"]), len(scene["target"]), self.config.frames
         path = pad_path(Cameras(scene["K"][m:], scene["c2w"][m:]), frames)
@@ -188,12 +189,12 @@ class Evaluator:
             np.concatenate([scene["c2w"][:m], path.c2w]),
         )
         rgb = np.concatenate([scene["rgb"], np.repeat(scene["rgb"][-1:], frames - n, 0)])
-        views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
+        views: dict[str, Any] = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
         truth = views.pop("target_rgb")
-        photos = scene["output"]["rgb"][:m]
-        prepare, config = self.prepare(photos.shape[1:3])
+        prepare, config = self.prepare(scene["output"]["rgb"].shape[1:3])
         if config.output_size != (config.height, config.width):
-            views["context_full"] = np.asarray(photos, np.float32)
+            model_size = (config.height, config.width)
+            views["full"] = whole(scene["photos"], config.output_size, model_size).arrays()
         prepared = prepare(self.params, views)
         latents, info = self.generate(self.params, prepared, self.noise(m))
         self.raise_if_failed(info)

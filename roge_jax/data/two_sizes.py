@@ -55,7 +55,7 @@ def open_views(
 
     `take(context, target)` is a dict of what was asked for, contexts first: `context`, `target`, c2w (float64); rgb [., h, w, 3],
     K and the targets' depth (or None) at the model's `size`; under `output` the same three at the output size, which is
-    the model's if not given, and `photo_depth`, that of the contexts. A depth map is picked from the nearest pixel,
+    the model's if not given, and `photo_depth`, that of the contexts; `photos`, the contexts uncut, each of its own size. A depth map is picked from the nearest pixel,
     never averaged. Procedural scenes are rendered at the larger of the sizes.
     """
     output = output or size
@@ -89,7 +89,8 @@ def _rendered(name: str, views: int, size: Size, sweep: Any, output: Size) -> tu
                 "photo_depth": depth[:m],
             }
 
-        return _both(at, size, output, made["c2w"][order], context, target)
+        photos = [made["rgb"][i] for i in context]
+        return _both(at, size, output, made["c2w"][order], context, target, photos)
 
     return made["c2w"], take
 
@@ -113,7 +114,8 @@ def _photographed(
                 rgb, K = (np.stack(part) for part in zip(*cut))
             return {"rgb": rgb, "K": K, "depth": None, "photo_depth": None}
 
-        return _both(at, size, output, np.asarray(cameras.c2w), context, target)
+        photos = [scene.images[i] for i in context]
+        return _both(at, size, output, np.asarray(cameras.c2w), context, target, photos)
 
     return np.asarray(scene.cameras.c2w, np.float64), take
 
@@ -125,11 +127,13 @@ def _both(
     c2w: np.ndarray,
     context: list[int],
     target: list[int],
+    photos: list[np.ndarray],
 ) -> dict[str, Any]:
     large = at(output)
     small = large if output == size else at(size)
     own = {key: small[key] for key in ("rgb", "K", "depth")}
-    return own | {"c2w": c2w, "context": context, "target": target, "output": large}
+    named = {"c2w": c2w, "context": context, "target": target, "photos": photos}
+    return own | named | {"output": large}
 
 
 def _cut(image: np.ndarray, K: np.ndarray, like: Size, size: Size) -> tuple[np.ndarray, np.ndarray]:
