@@ -89,6 +89,13 @@ class Pyramid(NamedTuple):
         return found[0] + share * (found[1] - found[0])
 
 
+def working_bytes(photos: int, height: int, width: int, views: int) -> int:
+    """Bytes that `render` needs beside `views` pictures that are kept: the photos' rows, and one view's samples."""
+    pixels = height * width
+    rows = 2 * photos * pixels * 12 * 4  # as fine as twice as many pixels, and coarser levels
+    return 4 * (3 * views * pixels + rows // 4 + photos * pixels * (2 * 12 + 12))
+
+
 @jax.named_scope("render")
 def render(
     photos: Photos,
