@@ -119,8 +119,12 @@ def enlarged(cut: jax.Array, height: int, width: int) -> jax.Array:
         shares.append((1.0 - (at - low), at - low))
     four = [(i, j) for i in (0, 1) for j in (0, 1)]
     share = np.stack([shares[0][i][:, None] * shares[1][j][None] for i, j in four])
+    share = jnp.asarray(share, jnp.float32)
     values = jnp.stack([cut[places[0][i]][:, places[1][j]] for i, j in four])
-    nearest = np.eye(4, dtype=np.float32)[share.argmax(0)].transpose(2, 0, 1)
-    own = (nearest * values).sum(0, keepdims=True)
-    share = share.astype(np.float32) * (jnp.abs(values - own) < TOGETHER)
+    # The side of an edge with the larger share, which cuts corners where the nearest neighbour makes steps.
+    own, most = values[0], jnp.zeros((height, width))
+    for i in range(4):
+        agreed = (share * (jnp.abs(values - values[i : i + 1]) < TOGETHER)).sum(0) + 1e-3 * share[i]
+        own, most = jnp.where(agreed > most, values[i], own), jnp.maximum(agreed, most)
+    share = share * (jnp.abs(values - own[None]) < TOGETHER)
     return (share * values).sum(0) / share.sum(0)

@@ -91,6 +91,17 @@ def test_enlarged_cuts_never_lie_between_two_surfaces():
     np.testing.assert_allclose(same, cut)
 
 
+def test_enlarged_edges_cut_corners():
+    """A slanted edge of cells has a finer one, closer to the line than the cells' own steps."""
+    y, x = np.mgrid[:24, :32] + 0.5
+    line = np.where(x + 0.6 * y < 22, 2.0, 9.0)
+    cells = np.where(x[::4, ::4] + 1.5 + 0.6 * (y[::4, ::4] + 1.5) < 22, 2.0, 9.0)
+    big = np.asarray(aggregate.enlarged(jnp.asarray(cells), 24, 32)).round(4)
+    steps = cells.repeat(4, 0).repeat(4, 1)
+    assert set(np.unique(big)) == {2.0, 9.0}
+    assert (big != line).mean() < 0.6 * (steps != line).mean()
+
+
 def test_a_pyramid_gives_means_of_what_is_finer():
     photos = RNG.random((2, 16, 24, 3)).astype(np.float32)
     pyramid = rendering.Pyramid.of(jnp.asarray(photos))
