@@ -30,7 +30,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
-from .aggregate import settled, with_structure
+from .aggregate import at_cuts, occupied, settled, with_structure
 from .rendering import Blend, Photos, render
 from .sweep import (
     EPS,
@@ -38,6 +38,7 @@ from .sweep import (
     Motion,
     agreement,
     all_cuts,
+    cut_at,
     fetch,
     in_pixels_of,
     inverse_depth,
@@ -177,14 +178,24 @@ def look_up(
         h, w = photos.shape[1:3]
         where, size = pixels_of(h, w, 1), (wide.size[:, 0], wide.size[:, 1])
         way = wide.into(way)
-        values, seen = fetch(structured, way, where, all_cuts(cuts, h * w, reach), size)
-        cut = settled(values, seen, alike, belief, h, w)
-        inverse = inverse_depth(cut.reshape(1, -1), cuts, reach)
+
+        def agreed(inverse, belief):
+            many = jnp.broadcast_to(inverse[:, None], (len(inverse), h * w))
+            values, seen = fetch(structured, way, where, many, size)
+            return settled(values, seen, alike, belief, h, w)
+
+        # All depths that photos share, then as many again where the view's surfaces are.
+        cut = agreed(inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach), belief)
+        near = occupied(inverse_depth(cut, cuts, reach), cuts)
+        step = near[1] - near[0]
+        inverse = near[0] + step * agreed(near, at_cuts(belief, cut_at(near, cuts, reach)))
+        cut = cut_at(inverse, cuts, reach)
         found, seen = (
-            x.reshape(len(x), h, w, -1) for x in fetch(wide.rgb, way, where, inverse, size)
+            x.reshape(len(x), h, w, -1)
+            for x in fetch(wide.rgb, way, where, inverse.reshape(1, -1), size)
         )
         _, share, (_, gate, rest) = choose(cut, found, seen)
-        return own, Blend(cut, reach, share, gate, head, rest)
+        return own, Blend(inverse, step, share, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.
@@ -194,7 +205,7 @@ def look_up(
         return looked
     scale = photo_cameras[0][None, :, 0, 0] / cameras[0][:, None, 0, 0]
     size = {"height": full.height, "width": full.width}
-    return looked._replace(full=render(full.photos, way, blend, scale, cuts=cuts, **size))
+    return looked._replace(full=render(full.photos, way, blend, scale, **size))
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from .aggregate import enlarged
-from .sweep import EPS, Motion, bilinear, inverse_depth, meet_at, moved_into, pixels_of, texels
+from .aggregate import TOGETHER, enlarged
+from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, texels
 
 Array = Any  # of JAX, or of NumPy before a program takes it
 LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
@@ -43,8 +43,8 @@ class Photos(NamedTuple):
 class Blend(NamedTuple):
     """What a view takes from the photos, at the model's size."""
 
-    cut: jax.Array  # [v, h, w]
-    reach: jax.Array  # [v], see `sweep.shared_reach`
+    inverse: jax.Array  # [v, h, w] inverse depth
+    step: jax.Array  # [v] between the inverse depths that were compared
     share: jax.Array  # [v, m, h, w, 1] of each photo
     gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
     head: jax.Array  # [v, h, w, 3] the RGB head's picture
@@ -103,7 +103,6 @@ def render(
     blend: Blend,
     scale: jax.Array,
     *,
-    cuts: int,
     height: int,
     width: int,
 ) -> jax.Array:
@@ -118,16 +117,15 @@ def render(
     pyramid = Pyramid.of(photos.rgb)
 
     def one(view):
-        return _render(pyramid, photos, *view, cuts, height, width)
+        return _render(pyramid, photos, *view, height, width)
 
     return jax.lax.map(one, (way, blend, scale))
 
 
-def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, cuts, height, width):
-    h, w = blend.cut.shape
+def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, height, width):
+    h, w = blend.inverse.shape
     where = pixels_of(height, width, (h / height, w / width))
-    cut = enlarged(blend.cut, height, width)
-    inverse = inverse_depth(cut.reshape(1, -1), cuts, blend.reach)
+    inverse = enlarged(blend.inverse, height, width, TOGETHER * blend.step).reshape(1, -1)
     met = meet_at(whole.into(way), where, inverse, (whole.size[:, 0], whole.size[:, 1]))
     x, y, depth, seen = (found[:, 0] for found in met)
     finer = (

@@ -44,6 +44,11 @@ def inverse_depth(cut: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> 
     return (jnp.maximum(reach * cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
 
 
+def cut_at(inverse: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> jax.Array:
+    """The cut of an inverse depth: `inverse_depth` backwards."""
+    return (inverse * NEAREST) ** (1.0 / SPACING) * (cuts - 1) / reach
+
+
 def all_cuts(cuts: int, pixels: int, reach: jax.Array | float = 1.0) -> jax.Array:
     """Inverse depths [cuts, pixels] of whole cuts, the same for every pixel."""
     inverse = inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach)
