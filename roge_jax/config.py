@@ -168,14 +168,13 @@ class RoGeConfig:
                 "cuts, and a patch that is a multiple of 4."
             )
         if self.output is not None and (
-            not self.renderer.lookup
-            or len(self.output) != 2
+            len(self.output) != 2
             or self.output[0] < self.recon_height
             or self.output[1] < self.recon_width
         ):
             raise UserError(
                 f"Output size {self.output} does not fit: give two numbers, at least {self.recon_height} and "
-                f"{self.recon_width}, and a model with renderer.lookup, or null."
+                f"{self.recon_width}, or null."
             )
         if self.frames < 1 or self.frames % 4 != 1:
             k = max(self.frames - 1, 0) // 4
@@ -186,9 +185,9 @@ class RoGeConfig:
     @property
     def output_size(self) -> tuple[int, int]:
         """(height, width) of the pictures that are made."""
-        return (
-            (self.height, self.width) if self.output is None else (self.output[0], self.output[1])
-        )
+        if self.output is None or not self.renderer.lookup:
+            return self.height, self.width
+        return self.output[0], self.output[1]
 
     def at_size(
         self, height: int, width: int, recon: tuple[int, int] | None = None

@@ -18,6 +18,7 @@ from .config import DiTConfig, EncoderConfig, RendererConfig, RoGeConfig, VAECon
 from .core import sharding, target
 from .core.attention import SCORES_BYTES
 from .core.params import flatten
+from .recon import rendering
 from .recon.lookup import AGREED, ALONG, BLOCKS, CELL, FINE, MATCHED, WIDTH
 from .recon.ray_scene import MERGES
 from .recon.vggt import SPECIALS, encoder_grid
@@ -388,25 +389,27 @@ def report(
     half: bool,
     solver: str,
 ) -> str:
-    """What `--dry-run` prints: a video of `frames` frames from m photos.
-
-    `later`: contexts of the windows after the first; `half`: bfloat16; `solver`: a line on it.
-    """
+    """What `--dry-run` prints: a video of `frames` frames from m photos, `later` contexts in windows after the first;
+    `half`: bfloat16; `solver`: a line on it."""
     runs = -(-frames // config.frames)
     later = later if runs > 1 else m
     dtype = jnp.bfloat16 if half else jnp.float32
     first, next_ = (estimate(config, k, evaluations, dtype=dtype) for k in (m, later))
     total = first.total_flops + (runs - 1) * next_.total_flops
     peak = max(first.peak_bytes, next_.peak_bytes)
-    lh, lw = config.latent_size
+    size, pictures = config.output_size, ""
+    if size != (config.height, config.width):
+        pictures = f" for pictures of {size[0]}x{size[1]}"
+        peak += rendering.working_bytes(max(m, later), *size, config.frames + 2 * frames)
+    latents = (config.slots(m), *config.latent_size, config.vae.latent)
     lines = [
         f"model     {config.name}: {sum(weight_bytes(config).values()) / 4e6:,.1f} M parameters, "
         f"{sum(first.weights.values()) / 1e9:,.2f} GB in {'bfloat16' if half else 'float32'}",
-        f"video     {frames} frames of {config.height}x{config.width} (reconstruction at "
+        f"video     {frames} frames of {config.height}x{config.width}{pictures} (reconstruction at "
         f"{config.recon_height}x{config.recon_width}), windows of {config.frames}: {runs}",
         f"photos    {m}" + (f", then {later} with frames already made" if later != m else ""),
         "tokens    " + ", ".join(f"{n:,} {name}" for name, n in first.tokens.items()),
-        f"latents   {config.slots(m)} x {lh} x {lw} x {config.vae.latent}",
+        f"latents   {' x '.join(map(str, latents))}",
         f"solver    {solver}",
         "",
         f"{'stage (first window)':24s}{'FLOPs':>16s}{'working memory':>18s}",

@@ -2,22 +2,30 @@
 
 Per scene, `context` photos are spread over a run of up to frames + context consecutive views and the others are
 generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,
-`mean_context`, `plane` at the true median depth or, without depth, swept; `depth_warp` where depth is complete) and
+`mean_context`, `plane` at the true median depth or, without depth, swept; `plane_sweep`, depth by semi-global matching;
+`depth_warp` where depth is complete) and
 beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means carry bootstrap intervals over scenes.
+All is compared at `--size`, whatever the model's own; frames that the model makes smaller are enlarged.
+A run that was stopped goes on, given the same words, with the scenes that it has in OUT.part.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from .data.two_sizes import Size, check_output, open_views
+from .data.two_sizes import spread as spread
 from .errors import UserError
 from .files.entry import number, one_of
-from .files.folders import output_file, write_json
+from .files.folders import fingerprint_files, output_file, write_json
+from .files.parts import Item, load_item, parts, save_item
 
+SMALLEST = 32  # pixels on a side that LPIPS needs
 HELD_OUT = "procedural:1000000000..1000000049"
 
 
@@ -43,6 +51,17 @@ def parser() -> argparse.ArgumentParser:
         type=number(1),
         metavar="N",
         help="N views of each scene, every one from the --context photos nearest to it",
+    )
+    p.add_argument(
+        "--size",
+        type=size_of,
+        metavar="HEIGHTxWIDTH",
+        help="at which truth, photos and pictures are compared; smaller pictures are enlarged\n(default: that of the pictures that the model makes)",
+    )
+    p.add_argument(
+        "--lpips",
+        type=one_of(("alex", "vgg", "both", "none")),
+        help="trunk of LPIPS: alex, vgg, both, none (default: alex where its weights are installed)",
     )
     p.add_argument("--steps", type=number(1), help="sampling steps (default: the model's own)")
     p.add_argument("--solver", help="sampler (default: the model's own)")
@@ -87,18 +106,6 @@ def expand(specs: list[str]) -> list[str]:
     return names
 
 
-def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]]:
-    """(context ids, target ids) of a scene: a centred run of views, contexts in the middle of equal parts of it."""
-    run = min(views, frames + contexts)
-    if run <= contexts:
-        raise UserError(
-            f"{views} views cannot give {contexts} contexts and a target: use fewer with --context."
-        )
-    start = (views - run) // 2
-    context = [start + int((i + 0.5) * run / contexts) for i in range(contexts)]
-    return context, [i for i in range(start, start + run) if i not in context]
-
-
 def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[int], list[int]]]:
     """(context ids, the target alone) of up to `count` views, evenly over all: the views nearest to each, nearest first.
 
@@ -118,58 +125,6 @@ def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[in
     return found
 
 
-Take = Callable[[list[int], list[int]], dict[str, Any]]
-
-
-def open_views(
-    name: str, views: int, size: tuple[int, int], sweep, convention: str | None = None
-) -> tuple[np.ndarray, Take]:
-    """The cameras c2w [v, 4, 4] of a scene (`views` of a procedural one), and what gives some of its views.
-
-    `take(context, target)` is a dict of what was asked for at generation size, contexts first: rgb [., h, w, 3], K, c2w
-    (float64), the targets' depth or None.
-    """
-    from .scenes import scene as scenes
-
-    if name.startswith("procedural:"):
-        from .procedural.scenes import SWEEP, sample_sequence
-
-        made = sample_sequence(
-            scenes.procedural_seed(name),
-            frames=views,
-            height=size[0],
-            width=size[1],
-            sweep=SWEEP if sweep is None else tuple(sweep),
-        )
-
-        def rendered(context: list[int], target: list[int]) -> dict[str, Any]:
-            order = context + target
-            return {
-                "rgb": made["rgb"][order].astype(np.float32) / 255.0,
-                "K": made["K"][order],
-                "c2w": made["c2w"][order],
-                "depth": made["depth"][target],
-                "context": context,
-                "target": target,
-            }
-
-        return made["c2w"], rendered
-    scene = scenes.load_scene(name, convention=convention)
-
-    def taken(context: list[int], target: list[int]) -> dict[str, Any]:
-        images, cameras = scenes.prepare(scene, context + target, *size, drop_duplicates=False)
-        return {
-            "rgb": images,
-            "K": np.asarray(cameras.K),
-            "c2w": np.asarray(cameras.c2w),
-            "depth": None,
-            "context": context,
-            "target": target,
-        }
-
-    return np.asarray(scene.cameras.c2w, np.float64), taken
-
-
 class Evaluator:
     """The model's jitted pieces, compiled once for all scenes of a size."""
 
@@ -186,6 +141,7 @@ class Evaluator:
         from .sampling.windows import window_noise
         from .video import flow, solvers, vae
 
+        self._prepare: dict[Size, Any] = {}
         self.params, self.config = load_model(checkpoint)
         config = self.config
         self.settings = s = sampling.Settings(steps, solver, schedule).of(config)
@@ -193,19 +149,38 @@ class Evaluator:
             s.schedule, s.steps, shift=config.flow.shift, solver=s.solver, model=config.name
         )
         table = solvers.tabulate(s.solver, grid)
-        self.prepare = jax.jit(functools.partial(model.prepare, config=config))
         self.generate = jax.jit(functools.partial(model.generate, config=config, solver=table))
         self.decode = jax.jit(functools.partial(model.decode_video, config=config))
         self.encode = jax.jit(functools.partial(vae.encode, cfg=config.vae))
         self.noise = functools.partial(window_noise, seed, 0, config=config)
         self.raise_if_failed = solvers.raise_if_failed
 
+    def prepare(self, size: Size):
+        """`model.prepare`, jitted, with the reconstruction's picture also at `size` if the model can make it so large."""
+        import functools
+
+        import jax
+
+        from . import model
+
+        if size not in self._prepare:
+            config = self.config
+            own = (config.height, config.width)
+            least = (config.recon_height, config.recon_width)
+            larger = size != own and size[0] >= least[0] and size[1] >= least[1]
+            config = dataclasses.replace(config, output=size if larger else None)
+            self._prepare[size] = jax.jit(functools.partial(model.prepare, config=config)), config
+        return self._prepare[size]
+
     def videos(self, scene: dict[str, Any]) -> dict[str, np.ndarray]:
-        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the scene's targets."""
+        """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, at the model's size or,
+        of models that read colours from the photos, at the output size, from the whole photos.
+        """
         from .data.views import make_sample
         from .geometry.cameras import Cameras
-        from .geometry.crops import resize
         from .geometry.packing import pad_path
+        from .sampling.video import at_output
+        from .sampling.whole import whole
 
         m, n, frames = len(scene["context"]), len(scene["target"]), self.config.frames
         path = pad_path(Cameras(scene["K"][m:], scene["c2w"][m:]), frames)
@@ -214,27 +189,31 @@ class Evaluator:
             np.concatenate([scene["c2w"][:m], path.c2w]),
         )
         rgb = np.concatenate([scene["rgb"], np.repeat(scene["rgb"][-1:], frames - n, 0)])
-        views = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
+        views: dict[str, Any] = make_sample(rgb, K, c2w, m, scale_rule=self.config.scale_rule)
         truth = views.pop("target_rgb")
-        prepared = self.prepare(self.params, views)
+        prepare, config = self.prepare(scene["output"]["rgb"].shape[1:3])
+        if config.output_size != (config.height, config.width):
+            model_size = (config.height, config.width)
+            views["full"] = whole(scene["photos"], config.output_size, model_size).arrays()
+        prepared = prepare(self.params, views)
         latents, info = self.generate(self.params, prepared, self.noise(m))
         self.raise_if_failed(info)
-        h, w = truth.shape[1:3]
-        head = np.asarray(prepared.shown)
+        video = np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n]
+        shown = np.asarray(prepared.shown)[:n]
+        full = None if prepared.full is None else np.asarray(prepared.full)[:n]
+        encoded = self.encode(self.params["vae"], 2.0 * truth - 1.0)
         return {
-            "generated": np.asarray(self.decode(self.params, latents, detail=prepared.detail))[:n],
-            "rgb_head": np.stack([resize(image, h, w) for image in head[:n]]),
-            "vae_round_trip": np.asarray(
-                self.decode(self.params, self.encode(self.params["vae"], 2.0 * truth - 1.0))
-            )[:n],
+            "generated": video if full is None else at_output(video, shown, full, config),
+            "rgb_head": shown if full is None else full,
+            "vae_round_trip": np.asarray(self.decode(self.params, encoded))[:n],
         }
 
 
 def samples(
-    args: argparse.Namespace, name: str, frames: int, size: tuple[int, int]
+    args: argparse.Namespace, name: str, frames: int, size: Size, output: Size
 ) -> Iterator[dict[str, Any]]:
     """What is to be shown of one scene, as `take` of `open_views` gives it: one run, or with `close` many single views."""
-    c2w, take = open_views(name, frames + args.context, size, args.sweep, args.convention)
+    c2w, take = open_views(name, frames + args.context, size, args.sweep, args.convention, output)
     if args.close is None:
         yield take(*spread(len(c2w), args.context, frames))
     else:
@@ -263,22 +242,109 @@ def check_scenes(args: argparse.Namespace, names: list[str]) -> None:
             )
 
 
-def methods_of(
-    evaluator: Evaluator, scene: dict[str, Any], size: tuple[int, int]
-) -> dict[str, np.ndarray]:
-    """{method: [n, h, w, 3]} of the targets of one `take`: what the model makes, and what needs no learning."""
+def methods_of(evaluator: Evaluator, scene: dict[str, Any]) -> dict[str, np.ndarray]:
+    """{method: [n, h, w, 3]} of the targets of one `take` at its output size: the model's frames, enlarged where they come
+    smaller, and what needs no learning.
+    """
+    from .geometry.crops import resize
     from .metrics.baselines import baselines
+    from .metrics.plane_sweep import sweep_view
 
-    m, (K, c2w) = len(scene["context"]), (scene["K"], scene["c2w"])
-    simple, _ = baselines(scene["rgb"][:m], K[:m], c2w[:m], K[m:], c2w[m:], size, scene["depth"])
-    return evaluator.videos(scene) | simple
+    m, c2w, judged = len(scene["context"]), scene["c2w"], scene["output"]
+    rgb, K = judged["rgb"], judged["K"]
+    size = rgb.shape[1:3]
+    simple, _ = baselines(rgb[:m], K[:m], c2w[:m], K[m:], c2w[m:], size, judged["depth"])
+    if m > 1:
+        swept = (
+            sweep_view(rgb[:m], K[:m], c2w[:m], *view, size).rgb for view in zip(K[m:], c2w[m:])
+        )
+        simple["plane_sweep"] = np.stack(list(swept))
+    made = evaluator.videos(scene)
+    return {
+        name: np.stack([resize(np.clip(frame, 0.0, 1.0), *size) for frame in frames])
+        for name, frames in made.items()
+    } | simple
+
+
+def seen_in(scene: dict[str, Any]) -> np.ndarray | None:
+    """`metrics.seen.seen_by` of the targets of one `take`, [n, h, w]; None without true depth everywhere."""
+    from .metrics.seen import seen_by
+
+    judged, m, c2w = scene["output"], len(scene["context"]), scene["c2w"]
+    if judged["depth"] is None or judged["photo_depth"] is None:
+        return None
+    photos = (judged["photo_depth"], judged["K"][:m], c2w[:m])
+    targets = zip(judged["depth"], judged["K"][m:], c2w[m:])
+    return np.stack([seen_by(depth, K, pose, *photos) for depth, K, pose in targets])
+
+
+def evaluate_scene(
+    evaluator: Evaluator,
+    views: list[dict[str, Any]],
+    learned: dict[str, Any],
+    close: bool,
+) -> Item:
+    """The numbers of one scene, and of its middle view the pictures and their names: photos, truth, methods."""
+    from .metrics.scores import scores
+    from .metrics.seen import pixel_split
+
+    row: dict[str, Any] = {}
+    for key in ("context", "target"):
+        row[key] = [part[key] for part in views] if close else views[0][key]
+    found: dict[str, list[dict[str, float]]] = {}
+    counted = []
+    for index, part in enumerate(views):
+        photos, truth = np.split(part["output"]["rgb"], [len(part["context"])])
+        made, counts = methods_of(evaluator, part), seen_in(part)
+        order = {} if close else {"places": part["target"], "photos": part["context"]}
+        for method, frames in made.items():
+            numbers = scores(frames, truth, learned, counts=counts, **order)
+            found.setdefault(method, []).append(numbers)
+        if counts is not None:
+            counted.append(counts)
+        if index == len(views) // 2:
+            middle = len(truth) // 2
+            pictures = [*photos, truth[middle], *(x[middle] for x in made.values())]
+            labels = [*(f"photo {i}" for i in range(len(photos))), "truth", *made]
+    if counted:
+        row["pixels"] = pixel_split(np.concatenate(counted))
+    for method, many in found.items():
+        row[method] = {k: float(np.mean([one[k] for one in many])) for k in many[0]}
+    return Item(row, pictures, labels)
+
+
+def learned_metrics(choice: str | None) -> dict[str, Any]:
+    """LPIPS by `--lpips`; if nothing was asked for, that of AlexNet or, without its weights, none and a note."""
+    from .metrics.learned import lpips_metrics
+
+    if choice == "none":
+        return {}
+    try:
+        return lpips_metrics(("alex", "vgg") if choice == "both" else (choice or "alex",))
+    except UserError as error:
+        if choice is not None:
+            raise
+        print(f"note: no LPIPS column. {error}")
+        return {}
+
+
+def size_of(text: str) -> Size:
+    """HEIGHTxWIDTH."""
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is no size: write HEIGHTxWIDTH in pixels, e.g. 192x336"
+        )
+    return int(height), int(width)
 
 
 def main(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
-    from .metrics import image, report
+    from .checkpoint import find_model
+    from .metrics import report
+    from .metrics.scores import SETTINGS
 
     output_file(args.out, "--out")
     if args.sheet:
@@ -290,38 +356,25 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     if args.sweep and not args.sweep[0] <= args.sweep[1]:
         raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
     check_scenes(args, names)
+    learned = learned_metrics(args.lpips)
     evaluator = Evaluator(
         args.checkpoint, args.solver or "", args.steps or 0, args.seed, args.schedule or ""
     )
     config = evaluator.config
     size = (config.height, config.width)
-    results, rows, methods = [], [], []
+    output = args.size or config.output_size
+    if args.size or learned:
+        check_output(output, size, SMALLEST)
     if args.context > config.max_context:
         raise UserError(
             f"--context {args.context}: this model ({config.name}) takes 1 to {config.max_context} photos."
         )
-    for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
-        parts = list(samples(args, name, config.frames, size))
-        made = [methods_of(evaluator, part, size) for part in parts]
-        row: dict[str, Any] = {"scene": Path(name).name or name}
-        for key in ("context", "target"):
-            row[key] = parts[0][key] if args.close is None else [part[key] for part in parts]
-        for method in made[0]:
-            found = [
-                image.image_metrics(np.clip(frames[method], 0.0, 1.0), part["rgb"][args.context :])
-                for frames, part in zip(made, parts)
-            ]
-            row[method] = {k: float(np.mean([one[k] for one in found])) for k in found[0]}
-        results.append(row)
-        methods += [method for method in made[0] if method not in methods]
-        frames, part = made[len(made) // 2], parts[len(parts) // 2]
-        photos, truth = np.split(part["rgb"], [args.context])
-        middle = len(truth) // 2
-        rows.append([*photos, truth[middle], *(x[middle] for x in frames.values())])
     settings = {
         "checkpoint": str(args.checkpoint),
+        "weights": fingerprint_files(find_model(args.checkpoint), "config.json", "*.safetensors"),
         "model": config.name,
-        "size": list(size),
+        "size": list(output),
+        "model_size": list(size),
         "context": args.context,
         "close": args.close,
         "frames": config.frames,
@@ -330,18 +383,34 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "schedule": evaluator.settings.schedule,
         "seed": args.seed,
         "sweep": args.sweep,
-        "metrics": image.SETTINGS,
+        "convention": args.convention,
+        "lpips": list(learned),
     }
-    document = report.build(settings, results, models=("generated", "rgb_head"))
-    write_json(args.out, document)
+    items = []
+    with parts(args.out, settings) as folder:
+        for name in tqdm(names, desc="evaluate", dynamic_ncols=True):
+            item = load_item(folder, name, pictures=bool(args.sheet))
+            if item is None:
+                views = list(samples(args, name, config.frames, size, output))
+                item = evaluate_scene(evaluator, views, learned, args.close is not None)
+                save_item(folder, name, item, pictures=bool(args.sheet))
+            items.append(item)
+        results = [
+            {"scene": Path(name).name or name} | item.row for name, item in zip(names, items)
+        ]
+        document = report.build(
+            settings | {"metrics": SETTINGS}, results, models=("generated", "rgb_head")
+        )
+        write_json(args.out, document)
     print(report.table(document))
     print(f"wrote {args.out}")
     if args.sheet:
         from PIL import Image
 
-        labels = [*(f"photo {i}" for i in range(args.context)), "truth", *methods]
         sheet = report.contact_sheet(
-            rows[:12], labels, row_labels=[r["scene"] for r in results[:12]]
+            [item.pictures for item in items[:12]],
+            items[0].labels,
+            row_labels=[r["scene"] for r in results[:12]],
         )
         few = Image.fromarray(sheet).quantize(255, kmeans=2, dither=Image.Dither.NONE)  # a third
         few.save(args.sheet, optimize=True)

@@ -9,12 +9,12 @@ itself). A scene's `views` are a dict of arrays, contexts first:
     vectors     [m, 11]                     `geometry.cameras.camera_vector` of the contexts
     target_rgb  [n, h, w, 3] in [0, 1]      training only
     context_recon, target_recon             optional: the same views at reconstruction size
-    context_full  [m, ., ., 3]              optional: the contexts, finer; sampling reads colours from them
+    full  recon.rendering.Photos            optional: the contexts whole and finer; sampling reads colours from them
 """
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ from .recon.picture import recon_cameras, recon_photos, show, show_all
 from .recon.relative import Relative, relative_cameras
 from .video import dit, flow, solvers, vae, vae_training
 
-Views = dict[str, jax.Array]
+Views = dict[str, Any]
 
 # What trains when pretrained networks are adapted (Sec. 3.3): the new embeddings and E1 fully, the rest by LoRA.
 NEW_EMBEDDINGS = r"^fusion/|^dit/patch_embed/"
@@ -358,7 +358,7 @@ class Prepared(NamedTuple):
     text: Tree | None
     detail: jax.Array | None  # [n, h, w, 3], see `preview.lost_detail`
     full: jax.Array | None = (
-        None  # [n, H, W, 3]: `shown` at the output's size, where views have `context_full`
+        None  # [n, H, W, 3]: `shown` at the output's size, where views have `full`
     )
 
 

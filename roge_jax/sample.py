@@ -84,7 +84,7 @@ def parser() -> argparse.ArgumentParser:
     option("--path-frame", frame_help, metavar="WHERE")
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
-    option("--size", "HEIGHTxWIDTH in pixels; the model's own if not given")
+    option("--size", "HEIGHTxWIDTH of the pictures; the model's own if not given")
     option("--scale", "divisor of all positions; the model's rule if not given", type=real)
     slots_help = "latents of photos while sampling: noised to the current level, clean, or free"
     option("--context-slots", slots_help, "noised", type=one_of(SLOTS))
@@ -207,7 +207,7 @@ def main(args: argparse.Namespace) -> None:
             params, _ = load_weights(args, mesh)
         beside = Beside(scene, photos.ids, config, args.convention)
         print(
-            f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.height}x{config.width}, {config.name}"
+            f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.output_size[0]}x{config.output_size[1]}, {config.name}"
         )
         plan = None
         if args.tolerance is not None or args.max_cost is not None:

@@ -1,7 +1,7 @@
 """Test-suite settings. The environment is set before JAX is imported; settings made outside win.
 
 What runs: the fast suite by default; `-m slow`, `-m parity` (or a test named by its node id) selects the rest. Tests on
-developer data look for `ROGE_DEV_DATA`, a folder with `parity/` and `scenes/`, and skip with that reason without it.
+developer data look for `ROGE_DEV_DATA`, a folder with `parity/`, `scenes/` and `weights/`, and skip with that reason without it.
 """
 
 import os

@@ -36,7 +36,15 @@ def test_results_follow_the_contract(tiny, tmp_path, capsys):
     args += ["--steps", "2", "--out", str(out), "--sheet", str(sheet)]
     evaluate.main(evaluate.parser().parse_args(args))
     results = json.loads(out.read_text())
-    methods = {"generated", "rgb_head", "nearest", "mean_context", "plane", "vae_round_trip"}
+    methods = {
+        "generated",
+        "rgb_head",
+        "nearest",
+        "mean_context",
+        "plane",
+        "plane_sweep",
+        "vae_round_trip",
+    }
     assert methods <= set(results["means"])
     assert len(results["scenes"]) == 2
     for scene in results["scenes"]:
@@ -94,6 +102,91 @@ def test_close_views_are_shown_from_their_nearest_photos(tiny, tmp_path):
     assert first["target"] == [[0]] and first["plane"]["psnr"] != row["plane"]["psnr"]
 
 
+def test_at_another_size_everything_is_compared_there(tiny, tmp_path, monkeypatch):
+    """Truth, photos and baselines at the size asked for; the model's frames, also those that come at that size."""
+    own, seen = evaluate.Evaluator.videos, []
+
+    def videos(self, scene):
+        made = own(self, scene)
+        assert {x.shape[1:3] for x in made.values()} == {(32, 48)}
+        seen.append(scene)
+        return made | {"rgb_head": scene["output"]["rgb"][len(scene["context"]) :]}  # the truth
+
+    monkeypatch.setattr(evaluate.Evaluator, "videos", videos)
+    out = tmp_path / "results.json"
+    words = [
+        "--checkpoint",
+        tiny,
+        "--scenes",
+        "procedural:1000000000",
+        "--context",
+        2,
+        "--steps",
+        2,
+    ]
+    words += ["--size", "64x96", "--lpips", "none", "--out", out]
+    evaluate.main(evaluate.parser().parse_args([str(w) for w in words]))
+    results = json.loads(out.read_text())
+    (row,), (scene,) = results["scenes"], seen
+    assert results["settings"]["size"] == [64, 96] and results["settings"]["model_size"] == [32, 48]
+    assert scene["rgb"].shape[1:3] == (32, 48) and scene["output"]["rgb"].shape[1:3] == (64, 96)
+    assert row["rgb_head"]["psnr"] == 100.0 and row["generated"]["psnr"] < 30
+    # of a model at half the size the fine detail is missing
+    assert row["vae_round_trip"]["sharpness_ratio"] < 0.8 < row["nearest"]["sharpness_ratio"]
+    assert 0 <= row["generated"]["temporal_ratio"] <= 2
+    split = [row["generated"][f"error_{name}"] for name in ("seen_two", "seen_one", "unseen")]
+    assert sum(split) == pytest.approx(1.0) and sum(row["pixels"].values()) == pytest.approx(1.0)
+    assert "lpips_alex" not in row["generated"]
+
+
+def test_a_stopped_run_goes_on_and_other_settings_are_refused(tiny, tmp_path, monkeypatch):
+    """Stopped at the third scene: the first two are not computed again, and the document is that of one go."""
+    words = ["--checkpoint", str(tiny), "--context", "2", "--steps", "2", "--lpips", "none"]
+    words += ["--scenes", "procedural:1000000000..1000000002"]
+    done = []
+    own = evaluate.evaluate_scene
+
+    def counted(*args):
+        if len(done) == 2 and state:
+            raise KeyboardInterrupt
+        done.append(args)
+        return own(*args)
+
+    def run(out, *more):
+        told = [*words, "--out", str(out), "--sheet", str(out.with_suffix(".png")), *more]
+        return evaluate.main(evaluate.parser().parse_args(told))
+
+    state = []
+    whole = run(tmp_path / "whole.json")
+    monkeypatch.setattr(evaluate, "evaluate_scene", counted)
+    out, state = tmp_path / "r.json", ["stop"]
+    with pytest.raises(KeyboardInterrupt):
+        run(out)
+    assert not out.exists() and len(list((tmp_path / "r.json.part").glob("*.npz"))) == 2
+    with pytest.raises(UserError, match=r"holds a run with steps 2, and 1 is asked for"):
+        run(out, "--steps", "1")
+    done.clear()
+    state.clear()
+    again = run(out)
+    assert len(done) == 1 and not (tmp_path / "r.json.part").exists()
+    assert json.loads(out.read_text()) == json.loads((tmp_path / "whole.json").read_text())
+    assert again["means"] == whole["means"]
+    assert out.with_suffix(".png").read_bytes() == (tmp_path / "whole.png").read_bytes()
+    run(out, "--steps", "1")  # a finished file is written anew
+
+
+def test_without_lpips_weights_a_note_says_how_to_get_them(monkeypatch, capsys):
+    from roge_jax.metrics import lpips_package
+
+    monkeypatch.setattr(lpips_package, "find", lambda trunk: None)
+    monkeypatch.delenv("ROGE_WEIGHTS", raising=False)
+    assert evaluate.learned_metrics(None) == {}
+    assert "note: no LPIPS column" in (said := capsys.readouterr().out) and "pip install" in said
+    assert evaluate.learned_metrics("none") == {} and not capsys.readouterr().out
+    with pytest.raises(UserError, match="pip install"):
+        evaluate.learned_metrics("vgg")
+
+
 def test_neighbours_are_near_in_place_and_direction():
     c2w = np.tile(np.eye(4), (5, 1, 1))
     c2w[:, 0, 3] = [0.0, 1.0, 2.1, 3.5, 8.0]
@@ -124,6 +217,9 @@ def test_neighbours_are_near_in_place_and_direction():
         (["--out", "{}"], "it is a folder"),
         (["--out", "{}/file/x.json"], "cannot be written"),
         (["--sheet", "x.txt"], "ends in .png"),
+        (["--size", "192"], "'192' is no size: write HEIGHTxWIDTH"),
+        (["--size", "0x9"], "'0x9' is no size"),
+        (["--lpips", "vgg16"], "did you mean 'vgg'"),
     ],
 )
 def test_mistakes_are_found_before_the_model_is_read(words, said, tmp_path, capsys, monkeypatch):

@@ -36,14 +36,14 @@ def output_folder(out: str | Path) -> Iterator[Path]:
                 f"--out {given} has files that are not of an earlier run (no {RECORD}): give another folder."
             )
         if part.exists():  # of a run that was killed, or is one still going?
-            with _held(part, given):
+            with held(part, given):
                 shutil.rmtree(part, ignore_errors=True)
         part.mkdir(parents=True)
     except OSError as error:
         raise UserError(
             f"--out {_shown(given)} cannot be written ({error.strerror}): give another folder."
         ) from None
-    with _held(part, given):
+    with held(part, given):
         try:
             yield part
         except BaseException:
@@ -243,7 +243,7 @@ def _shown(name: object) -> str:
 
 
 @contextlib.contextmanager
-def _held(folder: Path, given: object) -> Iterator[None]:
+def held(folder: Path, given: object) -> Iterator[None]:
     """Hold a folder's lock, which the system drops when its process ends, however it ends."""
     try:
         import fcntl

@@ -39,16 +39,16 @@ def warp(
     covers s > 1 photo pixels, it is the mean of ceil(s)^2 (at most 16) samples. Infinite depth is
     allowed (rotation only).
     """
-    grid = _grid(*depth.shape)
-    xy, front = _project(grid, depth, K_source, c2w_source, K, c2w)
-    valid = front & _inside(xy, rgb.shape)
+    grid = pixel_grid(*depth.shape)
+    xy, z = project(grid, depth, K_source, c2w_source, K, c2w)
+    valid = (z > 0.0) & _inside(xy, rgb.shape)
     steps = _supersampling(xy, valid)
     offsets = (np.arange(steps) + 0.5) / steps - 0.5
     total = np.zeros((*depth.shape, 3))
     for dy in offsets:
         for dx in offsets:
             if steps > 1:
-                xy, _ = _project(grid + np.array([dx, dy]), depth, K_source, c2w_source, K, c2w)
+                xy, _ = project(grid + np.array([dx, dy]), depth, K_source, c2w_source, K, c2w)
             total += bilinear(rgb, xy)
     return Warp(total / steps**2, valid)
 
@@ -207,15 +207,15 @@ def plane_sweep(
     factor = max(1, min(size) // SWEEP_WIDTH, context_rgb.shape[2] // SWEEP_WIDTH)
     small = _shrink(context_rgb, factor)
     shrink = np.diag([1.0 / factor, 1.0 / factor, 1.0])
-    grid = _grid(max(1, size[0] // factor), max(1, size[1] // factor))
+    grid = pixel_grid(max(1, size[0] // factor), max(1, size[1] // factor))
     found = []
     for d in np.asarray(depths, np.float64):
         depth = np.full(grid.shape[:2], d)
         count = np.zeros(grid.shape[:2])
         total, squares = np.zeros((*grid.shape[:2], 3)), np.zeros((*grid.shape[:2], 3))
         for rgb, k, pose in zip(small, context_K, context_c2w):
-            xy, front = _project(grid, depth, shrink @ k, pose, shrink @ np.asarray(K), c2w)
-            valid = front & _inside(xy, rgb.shape)
+            xy, z = project(grid, depth, shrink @ k, pose, shrink @ np.asarray(K), c2w)
+            valid = (z > 0.0) & _inside(xy, rgb.shape)
             colour = bilinear(rgb, xy) * valid[..., None]
             count += valid
             total += colour
@@ -272,7 +272,7 @@ def baselines(
     return {name: np.stack(images) for name, images in frames.items()}, depths
 
 
-def _project(
+def project(
     grid: np.ndarray,
     depth: np.ndarray,
     K_source: np.ndarray,
@@ -280,7 +280,10 @@ def _project(
     K: np.ndarray,
     c2w: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Source pixels [h, w, 2] of the target's pixels `grid` at `depth`, and whether in front [h, w]."""
+    """Source pixels [h, w, 2] of the target's pixels `grid` at `depth`, and their z-depth there [h, w].
+
+    Points at infinity have infinite z, points that are not in front of the source lie far outside of every picture.
+    """
     motion = np.linalg.inv(np.asarray(c2w_source, np.float64)) @ np.asarray(c2w, np.float64)
     pixels = np.concatenate([grid, np.ones((*grid.shape[:2], 1))], axis=-1)
     rays = pixels @ np.linalg.inv(np.asarray(K, np.float64)).T
@@ -289,10 +292,11 @@ def _project(
     pixels = points @ np.asarray(K_source, np.float64).T
     front = points[..., 2] > 1e-6
     z = np.where(front, points[..., 2], 1.0)[..., None]
-    return np.where(front[..., None], pixels[..., :2] / z, -1e6), front
+    xy = np.where(front[..., None], pixels[..., :2] / z, -1e6)
+    return xy, np.where(front, points[..., 2], -1.0) * depth
 
 
-def _grid(h: int, w: int) -> np.ndarray:
+def pixel_grid(h: int, w: int) -> np.ndarray:
     """Pixel centres [h, w, 2] as (x, y)."""
     x, y = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
     return np.stack([x, y], axis=-1)

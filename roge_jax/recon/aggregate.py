@@ -17,6 +17,7 @@ BELIEF = 0.1  # cost of a factor e in the network's probability
 LEAST = -12.0  # its logarithm is not taken for less
 HIDDEN = 1.0  # further cost of cuts that no photo sees
 STEP, JUMP = 0.04, 0.3  # cost of a neighbour one cut, and more than one cut, away
+TAIL, MARGIN = 0.02, 1.2  # of inverse depths: left out at either end, and added again
 TOGETHER = 1.5  # cuts by which neighbours on one surface differ at most
 
 
@@ -46,10 +47,13 @@ def difference(values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Arra
     something in front. Where no pair sees a cut, half of what strangers cost.
     """
     close, pairs = jnp.zeros(seen.shape[1:]), jnp.zeros(seen.shape[1:])
+    channels = [
+        values[..., c] for c in range(4)
+    ]  # sums along a last axis of four take ten times as long
     for i in range(len(values)):
         for j in range(i):
-            change = jnp.abs(values[i] - values[j])
-            cost = change[..., :3].mean(-1) + STRUCTURE * jnp.minimum(change[..., 3], 2.0)
+            red, green, blue, structure = (jnp.abs(x[i] - x[j]) for x in channels)
+            cost = (red + green + blue) / 3.0 + STRUCTURE * jnp.minimum(structure, 2.0)
             both = seen[i] * seen[j] * (1.0 - alike[i, j])
             close += both * jnp.exp(-cost / DIFFERENCE)
             pairs += both
@@ -105,8 +109,25 @@ def settled(
     return cheapest(semi_global(cost + HIDDEN * (seen.max(0).reshape(size) <= 0)))
 
 
-def enlarged(cut: jax.Array, height: int, width: int) -> jax.Array:
-    """Cuts [h, w] at [height, width]: bilinear on a surface, and from one of its sides at an edge, never between."""
+def occupied(inverse: jax.Array, count: int) -> jax.Array:
+    """`count` inverse depths, evenly spaced, over those that most of a view's pixels have [h, w]."""
+    low, high = jnp.quantile(inverse, jnp.asarray([TAIL, 1.0 - TAIL]))
+    low, high = low / MARGIN, jnp.maximum(high * MARGIN, low / MARGIN + 1e-3)
+    return low + (high - low) * jnp.arange(count) / (count - 1)
+
+
+def at_cuts(belief: jax.Array, cut: jax.Array) -> jax.Array:
+    """Logits [k, ch, cw] over whole cuts at others [j], between two of them in proportion."""
+    cut = jnp.clip(cut, 0.0, len(belief) - 1.0)
+    apart = jnp.abs(cut[:, None] - jnp.arange(len(belief), dtype=jnp.float32)[None])
+    return jnp.einsum("jk,kyx->jyx", jnp.maximum(1.0 - apart, 0.0), belief)
+
+
+def enlarged(
+    cut: jax.Array, height: int, width: int, together: jax.Array | float = TOGETHER
+) -> jax.Array:
+    """Cuts [h, w] at [height, width]: bilinear on a surface, where neighbours differ by less than `together`, and from one
+    of its sides at an edge, never between."""
     h, w = cut.shape
     places, shares = [], []
     for size, small in ((height, h), (width, w)):
@@ -115,9 +136,13 @@ def enlarged(cut: jax.Array, height: int, width: int) -> jax.Array:
         places.append((low, np.minimum(low + 1, small - 1)))
         shares.append((1.0 - (at - low), at - low))
     four = [(i, j) for i in (0, 1) for j in (0, 1)]
-    share = np.stack([shares[0][i][:, None] * shares[1][j][None] for i, j in four])
+    parts = [shares[0][i][:, None] * shares[1][j][None] for i, j in four]
+    share = jnp.asarray(np.stack(parts), jnp.float32)
     values = jnp.stack([cut[places[0][i]][:, places[1][j]] for i, j in four])
-    nearest = np.eye(4, dtype=np.float32)[share.argmax(0)].transpose(2, 0, 1)
-    own = (nearest * values).sum(0, keepdims=True)
-    share = share.astype(np.float32) * (jnp.abs(values - own) < TOGETHER)
+    # The side of an edge with the larger share, which cuts corners where the nearest neighbour makes steps.
+    own, most = values[0], jnp.zeros((height, width))
+    for i in range(4):
+        agreed = (share * (jnp.abs(values - values[i : i + 1]) < together)).sum(0) + 1e-3 * share[i]
+        own, most = jnp.where(agreed > most, values[i], own), jnp.maximum(agreed, most)
+    share = share * (jnp.abs(values - own[None]) < together)
     return (share * values).sum(0) / share.sum(0)

@@ -31,14 +31,15 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
-from .aggregate import settled, with_structure
-from .rendering import Blend, render
+from .aggregate import at_cuts, occupied, settled, with_structure
+from .rendering import Blend, Photos, render
 from .sweep import (
     EPS,
     SHARED,
     Motion,
     agreement,
     all_cuts,
+    cut_at,
     fetch,
     in_pixels_of,
     inverse_depth,
@@ -60,9 +61,9 @@ UNSEEN = -8.0  # logit of cuts that no photo sees
 
 
 class Full(NamedTuple):
-    """Photos finer than the model's, and the size of the picture that is wanted of them."""
+    """Whole photos finer than the model's, and the size of the picture that is wanted of them."""
 
-    photos: jax.Array  # [m, ., ., 3] in [0, 1]; they show what the photos at the model's size show
+    photos: Photos
     height: int
     width: int
 
@@ -150,7 +151,8 @@ def look_up(
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
     alike = twins(photo_cameras[1])
-    structured = None if full is None else with_structure(photos)
+    wide = None if full is None else full.photos.shrunk()
+    structured = None if wide is None else with_structure(wide.rgb)
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
@@ -172,19 +174,29 @@ def look_up(
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         looked, _, (mixed, _, _) = choose(cut, found, seen)
         own = Looked(mixed, head, looked, coarse)
-        if structured is None:
+        if wide is None:
             return own, None
-        _, h, w, _ = photos.shape
-        where = pixels_of(h, w, 1)
-        values, seen = fetch(structured, way, where, all_cuts(cuts, h * w, reach))
-        cut = settled(values, seen, alike, belief, h, w)
-        inverse = inverse_depth(cut.reshape(1, -1), cuts, reach)
+        h, w = photos.shape[1:3]
+        where, size = pixels_of(h, w, 1), (wide.size[:, 0], wide.size[:, 1])
+        way = wide.into(way)
+
+        def agreed(inverse, belief):
+            many = jnp.broadcast_to(inverse[:, None], (len(inverse), h * w))
+            values, seen = fetch(structured, way, where, many, size)
+            return settled(values, seen, alike, belief, h, w)
+
+        # All depths that photos share, then as many again where the view's surfaces are.
+        cut = agreed(inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach), belief)
+        near = occupied(inverse_depth(cut, cuts, reach), cuts)
+        step = near[1] - near[0]
+        inverse = near[0] + step * agreed(near, at_cuts(belief, cut_at(near, cuts, reach)))
+        cut = cut_at(inverse, cuts, reach)
         found, seen = (
-            x.reshape(-1, h, w, x.size // (len(x) * h * w))
-            for x in fetch(photos, way, where, inverse)
+            x.reshape(len(x), h, w, -1)
+            for x in fetch(wide.rgb, way, where, inverse.reshape(1, -1), size)
         )
         _, share, (_, gate, rest) = choose(cut, found, seen)
-        return own, Blend(cut, reach, share, gate, head, rest)
+        return own, Blend(inverse, step, share, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.
@@ -194,7 +206,7 @@ def look_up(
         return looked
     scale = photo_cameras[0][None, :, 0, 0] / cameras[0][:, None, 0, 0]
     size = {"height": full.height, "width": full.width}
-    return looked._replace(full=render(full.photos, way, blend, scale, cuts=cuts, **size))
+    return looked._replace(full=render(full.photos, way, blend, scale, **size))
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:

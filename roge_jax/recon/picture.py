@@ -1,5 +1,7 @@
 """The reconstruction's own picture of ray features: the RGB head's, and what the rays find in the photos."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -8,7 +10,7 @@ from ..core.layers import resized
 from ..core.params import Tree
 from . import lookup, ray_scene
 
-Views = dict[str, jax.Array]
+Views = dict[str, Any]  # arrays, see `roge_jax.model`
 
 
 def recon_cameras(views: Views, config: RoGeConfig) -> tuple[jax.Array, jax.Array]:
@@ -73,10 +75,10 @@ def decode_all(
 ) -> lookup.Looked:
     """`decode_rgb` with the parts it is made of, which training looks at too; without look-up all are the RGB head's.
 
-    `full`: also the picture at the output's size, if `context` has the photos for it (`context_full`).
+    `full`: also the picture at the output's size, if `context` has the photos for it (`full`).
     """
     cfg = config.renderer
-    finer = context.get("context_full") if full else None
+    finer = context.get("full") if full else None
     head = ray_scene.decode_rgb(params["renderer"]["rgb_head"], features, cfg=cfg)
     if not cfg.lookup:
         return lookup.Looked(head, head, head, head)

@@ -5,35 +5,46 @@ as they are given, so a picture is as sharp as they are. Where photos are finer 
 level of a pyramid that is not (Williams 1983).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from .aggregate import enlarged
-from .sweep import (
-    EPS,
-    Motion,
-    bilinear,
-    in_pixels_of,
-    inverse_depth,
-    meet_at,
-    pixels_of,
-    texels,
-)
+from .aggregate import TOGETHER, enlarged
+from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, texels
 
-LEVELS = (
-    3  # of the pyramid: photos up to four times finer than the picture are read without aliasing
-)
+Array = Any  # of JAX, or of NumPy before a program takes it
+LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
 DISAGREED = 0.05  # difference of the photos' colours at which half of the picture is not theirs
 FADE = 0.1  # weight of all photos below which they fade out
+
+
+class Photos(NamedTuple):
+    """Whole photos: the model's own show a window of these."""
+
+    rgb: Array  # [m, ph, pw, 3] in [0, 1]; beyond a photo's own size its border goes on
+    coarse: Array  # [m, ., ., 3] the same, about as fine as the model's photos
+    size: Array  # [m, 2] height and width of each in pixels of `rgb`
+    scale: Array  # [m, 2] pixels of `rgb` in one of the model's, down and across
+    offset: Array  # [m, 2] where the window begins in `rgb`
+
+    def shrunk(self) -> "Photos":
+        """The coarse ones in place of `rgb`."""
+        sides = zip(self.coarse.shape[1:3], self.rgb.shape[1:3], strict=True)
+        factor = jnp.asarray([[small / large for small, large in sides]])
+        moved = (factor * x for x in (self.size, self.scale, self.offset))
+        return Photos(self.coarse, self.coarse, *moved)
+
+    def into(self, way: Motion) -> Motion:
+        """`way`, in pixels of the model's photos, in pixels of these."""
+        return moved_into(way, self.scale, self.offset)
 
 
 class Blend(NamedTuple):
     """What a view takes from the photos, at the model's size."""
 
-    cut: jax.Array  # [v, h, w]
-    reach: jax.Array  # [v], see `sweep.shared_reach`
+    inverse: jax.Array  # [v, h, w] inverse depth
+    step: jax.Array  # [v] between the inverse depths that were compared
     share: jax.Array  # [v, m, h, w, 1] of each photo
     gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
     head: jax.Array  # [v, h, w, 3] the RGB head's picture
@@ -78,42 +89,49 @@ class Pyramid(NamedTuple):
         return found[0] + share * (found[1] - found[0])
 
 
+def working_bytes(photos: int, height: int, width: int, views: int) -> int:
+    """Bytes that `render` needs beside `views` pictures that are kept: the photos' rows, and one view's samples."""
+    pixels = height * width
+    rows = 2 * photos * pixels * 12 * 4  # as fine as twice as many pixels, and coarser levels
+    return 4 * (3 * views * pixels + rows // 4 + photos * pixels * (2 * 12 + 12))
+
+
 @jax.named_scope("render")
 def render(
-    photos: jax.Array,
+    photos: Photos,
     way: Motion,
     blend: Blend,
     scale: jax.Array,
     *,
-    cuts: int,
     height: int,
     width: int,
 ) -> jax.Array:
     """Pictures [v, height, width, 3] in [0, 1] of v views.
 
     Args:
-      photos: [m, ph, pw, 3] in [0, 1], of any size.
+      photos: of any size.
       way: motion from the views to the photos in pixels of the model's size.
       blend: at the model's size h x w, with leading axis v.
       scale: [v, m] focal length of the photo over that of the view, in pixels of the model's size.
     """
-    pyramid = Pyramid.of(photos)
-    size = photos.shape[1:3]
+    pyramid = Pyramid.of(photos.rgb)
 
     def one(view):
-        return _render(pyramid, size, *view, cuts, height, width)
+        return _render(pyramid, photos, *view, height, width)
 
     return jax.lax.map(one, (way, blend, scale))
 
 
-def _render(pyramid: Pyramid, size, way: Motion, blend: Blend, scale, cuts, height, width):
-    h, w = blend.cut.shape
+def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, height, width):
+    h, w = blend.inverse.shape
     where = pixels_of(height, width, (h / height, w / width))
-    way = in_pixels_of(way, (h / size[0], w / size[1]))
-    cut = enlarged(blend.cut, height, width)
-    inverse = inverse_depth(cut.reshape(1, -1), cuts, blend.reach)
-    x, y, depth, seen = (found[:, 0] for found in meet_at(way, where, inverse, size))
-    finer = jnp.sqrt(size[0] * size[1] / (height * width)) * scale[:, None] / depth
+    inverse = enlarged(blend.inverse, height, width, TOGETHER * blend.step).reshape(1, -1)
+    met = meet_at(whole.into(way), where, inverse, (whole.size[:, 0], whole.size[:, 1]))
+    x, y, depth, seen = (found[:, 0] for found in met)
+    finer = (
+        whole.scale[:, 1] * w / width * scale
+    )  # their pixels in one of the picture's, at equal depth
+    finer = finer[:, None] / depth
     colours = pyramid.read(x, y, jnp.log2(jnp.maximum(finer, 1e-6)))
     m = len(colours)
     colours, seen = colours.reshape(m, height, width, 3), seen.reshape(m, height, width, 1)
@@ -124,7 +142,8 @@ def _render(pyramid: Pyramid, size, way: Motion, blend: Blend, scale, cuts, heig
     head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
     mixed = head + rest + gate * (photos - head)
     # The mixture is cautious. Where the photos agree with one another they are taken as they are.
-    apart = (share * jnp.abs(colours - photos[None])).sum(0).mean(-1, keepdims=True)
+    apart = (share * jnp.abs(colours - photos[None])).sum(0)
+    apart = (apart[..., :1] + apart[..., 1:2] + apart[..., 2:]) / 3.0
     apart = _resized(_resized(apart / jnp.maximum(weight, EPS), h, w), height, width)
     trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * jnp.clip(weight / FADE, 0.0, 1.0)
     return jnp.clip(mixed + trust * (photos - mixed), 0.0, 1.0)

@@ -44,6 +44,11 @@ def inverse_depth(cut: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> 
     return (jnp.maximum(reach * cut, 0.0) / (cuts - 1)) ** SPACING / NEAREST
 
 
+def cut_at(inverse: jax.Array, cuts: int, reach: jax.Array | float = 1.0) -> jax.Array:
+    """The cut of an inverse depth: `inverse_depth` backwards."""
+    return (inverse * NEAREST) ** (1.0 / SPACING) * (cuts - 1) / reach
+
+
 def all_cuts(cuts: int, pixels: int, reach: jax.Array | float = 1.0) -> jax.Array:
     """Inverse depths [cuts, pixels] of whole cuts, the same for every pixel."""
     inverse = inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach)
@@ -66,7 +71,12 @@ def shared_reach(
     return jax.lax.stop_gradient(jnp.where(last < 0.0, 1.0, reach))
 
 
-def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, int]):
+Size = (
+    tuple[int, int] | tuple[jax.Array, jax.Array]
+)  # (height, width) of all photos, or [m] of each
+
+
+def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: Size):
     """Where one view's rays meet their cuts in m images of `size`: (x, y, seen), each [m, k, p].
 
     `way`: the view's motion in pixels of the images; pixels [p, 2] (centres at +0.5), inverse depths [k, p]. A cut is
@@ -76,9 +86,9 @@ def meet(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, in
     return x, y, seen
 
 
-def meet_at(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int, int]):
+def meet_at(way: Motion, pixels: jax.Array, inverse: jax.Array, size: Size):
     """`meet` with how deep a cut lies in the photos: (x, y, depth there / depth in the view, seen)."""
-    h, w = size
+    h, w = (jnp.broadcast_to(jnp.asarray(x), len(way.turn))[:, None, None] for x in size)
     ones = jnp.ones((len(pixels), 1))
     start = jnp.einsum("mij,pj->mpi", way.turn, jnp.concatenate([pixels, ones], -1))
     q = start[:, None] + inverse[None, :, :, None] * way.shift[:, None, None]
@@ -89,13 +99,19 @@ def meet_at(way: Motion, pixels: jax.Array, inverse: jax.Array, size: tuple[int,
     return x, y, z, seen.astype(jnp.float32)
 
 
-def fetch(images: jax.Array, way: Motion, pixels: jax.Array, inverse: jax.Array):
+def fetch(
+    images: jax.Array,
+    way: Motion,
+    pixels: jax.Array,
+    inverse: jax.Array,
+    size: Size | None = None,
+):
     """Values of m images [m, h, w, c] where one view's rays meet their cuts: ([m, k, p, c], seen [m, k, p]), as by `meet`.
 
-    Bilinear, border repeated.
+    Bilinear, border repeated. `size`: of the photos, if the images are larger than them.
     """
     m, h, w, _ = images.shape
-    x, y, seen = meet(way, pixels, inverse, (h, w))
+    x, y, seen = meet(way, pixels, inverse, (h, w) if size is None else size)
     first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
     return bilinear(texels(images), x, y, (h, w), first[:, None, None]), seen
 
@@ -154,6 +170,19 @@ def pixels_of(h: int, w: int, step: float | tuple[float, float]) -> jax.Array:
     down, across = step if isinstance(step, tuple) else (step, step)
     y, x = np.mgrid[:h, :w] + 0.5
     return jnp.asarray(np.stack([across * x, down * y], -1).reshape(-1, 2), jnp.float32)
+
+
+def moved_into(way: Motion, scale: jax.Array, offset: jax.Array) -> Motion:
+    """`way` in pixels of which `scale` [m, 2] make one and whose origin lies `offset` [m, 2] before it (down, across)."""
+
+    def moved(rows: jax.Array, last: jax.Array) -> jax.Array:
+        extra = (1,) * (rows.ndim - 2)
+        factor, start = (x[:, ::-1].reshape(-1, 2, *extra) for x in (scale, offset))
+        return jnp.concatenate([factor * rows + start * last, last], 1)
+
+    return Motion(
+        moved(way.turn[:, :2], way.turn[:, 2:]), moved(way.shift[:, :2], way.shift[:, 2:])
+    )
 
 
 def in_pixels_of(way: Motion, side: float | tuple[float, float]) -> Motion:

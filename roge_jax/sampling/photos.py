@@ -8,16 +8,13 @@ import numpy as np
 from ..config import RoGeConfig
 from ..errors import UserError, did_you_mean
 from ..geometry.cameras import Cameras
-from ..geometry.crops import cover_window, resize, scale_K
+from ..geometry.crops import resize, scale_K
 from ..scenes.coverage import see_path
 from ..scenes.overlap import select_overlapping
 from ..scenes.scene import Scene, distinct_views, prepare, select_context
+from .whole import Whole, whole
 
 DEFAULT_CONTEXT = 6  # photos, where the scene and the model have that many
-FULL_PIXELS = (
-    2_000_000  # of all photos together, that are kept finer than the pictures made of them
-)
-FINER = 2.0  # times the picture's sides: what a path that comes closer can still use
 
 
 class Photos(NamedTuple):
@@ -27,14 +24,13 @@ class Photos(NamedTuple):
     recon: np.ndarray | None  # [m, recon_h, recon_w, 3]
     cameras: Cameras  # K in pixels of `images`
     ids: tuple[int, ...]  # views of the scene
-    full: np.ndarray | None = (
-        None  # [m, ., ., 3] as fine as the pictures need them, where those are larger
-    )
+    full: Whole | None = None  # uncut and finer, where pictures are larger than the model
 
     def keep(self, kept: Sequence[int]) -> "Photos":
         """Some of them."""
         kept = list(kept)
-        recon, full = (None if x is None else x[kept] for x in (self.recon, self.full))
+        recon = None if self.recon is None else self.recon[kept]
+        full = None if self.full is None else self.full.keep(kept)
         ids = tuple(self.ids[i] for i in kept)
         return Photos(self.images[kept], recon, self.cameras[kept], ids, full)
 
@@ -86,41 +82,31 @@ def _view(word: str, scene: Scene) -> int:
 def read_photos(scene: Scene, ids: Sequence[int], config: RoGeConfig) -> Photos:
     """The photos `ids` of a scene, the first one being the world frame. Duplicates are dropped with a warning.
 
-    Where pictures are larger than the model (`config.output`), every photo is cut as the picture is, and the model sees a
-    resize of that.
+    Where pictures are larger than the model (`config.output`), every photo is cut as the picture is and shrunk for the
+    model, and kept whole besides.
     """
     ids = list(ids)
     size, output = (config.height, config.width), config.output_size
-    finest = size if output == size else _full_size(scene, ids, config)
-    full, cameras = prepare(scene, ids, *finest, drop_duplicates=False)
-    kept = distinct_views(full, cameras)
+    images, cameras = prepare(scene, ids, *output, drop_duplicates=False)
+    kept = distinct_views(images, cameras)
     if len(kept) < len(ids):
         prepare(scene, ids, *size)  # says which
-    ids, full, cameras = [ids[i] for i in kept], full[kept], cameras[kept]
+    ids, images, cameras = [ids[i] for i in kept], images[kept], cameras[kept]
     if len(ids) > config.max_context:
         raise UserError(
             f"{len(ids)} context photos: this model ({config.name}) takes 1 to {config.max_context}."
         )
-    images = np.stack([resize(image, *size) for image in full])
-    cameras = Cameras(scale_K(cameras.K, finest, size), cameras.c2w)
     recon, wanted = None, (config.recon_height, config.recon_width)
     if wanted != size and output != size:
-        recon = np.stack([resize(image, *wanted) for image in full])
+        recon = np.stack([resize(image, *wanted) for image in images])
     elif wanted != size and wanted[0] * size[1] == wanted[1] * size[0]:  # sharper than a resize
         recon, _ = prepare(scene, ids, *wanted, drop_duplicates=False)
-    return Photos(images, recon, cameras, tuple(ids), None if output == size else full)
-
-
-def _full_size(scene: Scene, ids: Sequence[int], config: RoGeConfig) -> tuple[int, int]:
-    """How finely photos are kept for pictures of `config.output_size`: as they are, but no finer than helps or fits."""
-    height, width = config.output_size
-    sizes = [size for size, i in zip(scene.sizes, range(len(scene)), strict=True) if i in ids]
-    own = min((cover_window(size, (height, width))[2] / height for size in sizes), default=1.0)
-    room = (FULL_PIXELS / (max(len(ids), 1) * height * width)) ** 0.5
-    factor = min(own, FINER, max(1.0, room))
-    least = max(config.recon_height / height, config.recon_width / width)
-    factor = max(factor, least)
-    return round(factor * height), round(factor * width)
+    if output == size:
+        return Photos(images, recon, cameras, tuple(ids))
+    images = np.stack([resize(image, *size) for image in images])
+    cameras = Cameras(scale_K(cameras.K, output, size), cameras.c2w)
+    full = whole([scene.images[i] for i in ids], output, size)
+    return Photos(images, recon, cameras, tuple(ids), full)
 
 
 def blank_scene(source: str, views: int, config: RoGeConfig) -> Scene:

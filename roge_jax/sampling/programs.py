@@ -108,7 +108,7 @@ def rgb_head(
     params: Tree, views: model.Views, *, config: RoGeConfig, scene_tokens: jax.Array | None = None
 ) -> tuple[jax.Array, jax.Array | None]:
     """The reconstruction's own picture of the targets [n, recon_h, recon_w, 3], and at the output's size [n, H, W, 3]
-    where `views` have `context_full`; the photos' rays are not queried."""
+    where `views` have `full`; the photos' rays are not queried."""
     tokens = scene_tokens
     tokens = model.reconstruct(params, views, config=config) if tokens is None else tokens
     if config.renderer.refinement == "shared":  # its refinement reads the rays of the photos

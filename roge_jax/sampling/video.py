@@ -34,6 +34,7 @@ from ..video import flow, solvers
 from . import limits, programs
 from .choices import Choices, Planned, around, spans
 from .photos import Photos
+from .whole import Whole
 from .windows import (
     chain_views,
     chained,
@@ -261,7 +262,7 @@ def sample(
             video = np.asarray(run.decode(params, x0, prepared.detail))[: last - first]
             low = np.asarray(prepared.shown)[: last - first]
             frame, preview = _shown((prepared.shown, prepared.full), last - first, config)
-            frames.append(_at_output(video, low, frame, config))
+            frames.append(at_output(video, low, frame, config))
             previews.append(preview)
             if picture is not None:
                 frame, preview = _shown(picture, len(shown), config)
@@ -292,7 +293,7 @@ def _shown(made, count: int, config: RoGeConfig) -> tuple[np.ndarray, np.ndarray
     return _enlarged(shown, *config.output_size), shown
 
 
-def _at_output(
+def at_output(
     video: np.ndarray, low: np.ndarray, full: np.ndarray, config: RoGeConfig
 ) -> np.ndarray:
     """A generated video [n, h, w, 3] at the output's size: what the generator changed of the reconstruction's picture
@@ -309,12 +310,12 @@ def _at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
 
 
 class _Seen(NamedTuple):
-    """What a window sees: images, the same at reconstruction size and finer or None, their cameras in the normalised
+    """What a window sees: images, the same at reconstruction size and whole or None, their cameras in the normalised
     frame, and which photos and which frames already made they are."""
 
     images: np.ndarray
     recon: np.ndarray | None
-    full: np.ndarray | None
+    full: Whole | None
     cameras: Cameras
     photos: list[int]
     made: list[int]
@@ -336,7 +337,7 @@ def _seen_later(
     return _Seen(
         joined(images),
         None if seen.recon is None else joined(seen.recon),
-        None if seen.full is None else joined(seen.full),
+        None if seen.full is None else seen.full.keep(kept).joined(old),
         concatenate(seen.cameras[kept], target[np.array(chosen, int)]),
         kept,
         chosen,

@@ -10,6 +10,7 @@ from .. import model
 from ..config import RoGeConfig
 from ..geometry.cameras import Cameras, Normalisation, camera_vector, concatenate, to_host
 from ..geometry.packing import GROUP, pad_path
+from .whole import Whole
 
 CHAIN_FRAMES = 2  # frames already made that join as contexts, where the model takes that many
 
@@ -66,10 +67,10 @@ def window_views(
     config: RoGeConfig,
     *,
     frames: int | None = None,
-    full: np.ndarray | None = None,
+    full: Whole | None = None,
 ) -> model.Views:
     """The arrays that the model takes for one window; cameras are normalised, the path is padded to the window, or to
-    `frames`. `recon` and `full`: the images at the reconstruction's size, and finer, where there are any."""
+    `frames`. `recon` and `full`: the images at the reconstruction's size, and whole, where there are any."""
     targets = pad_path(targets, config.frames if frames is None else frames)
     cameras = concatenate(contexts, targets)
     vectors = camera_vector(
@@ -81,9 +82,10 @@ def window_views(
         "c2w": cameras.c2w.astype(np.float32),
         "vectors": np.asarray(vectors, np.float32),
     }
-    for name, finer in (("context_recon", recon), ("context_full", full)):
-        if finer is not None:
-            views[name] = finer.astype(np.float32)
+    if recon is not None:
+        views["context_recon"] = recon.astype(np.float32)
+    if full is not None:
+        views["full"] = full.arrays()
     return views
 
 

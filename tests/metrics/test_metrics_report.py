@@ -156,3 +156,20 @@ def test_contact_sheet_refuses_what_it_cannot_place():
         report.contact_sheet([], [])
     with pytest.raises(UserError, match=r"images \[h, w, 3\], not \(4, 4\)"):
         report.contact_sheet([[image[..., 0]]], ["x"])
+
+
+def test_psnr_never_stands_alone_in_a_table_and_where_the_error_lies_is_not_ranked():
+    numbers = {"psnr": 20.0, "gradient_psnr": 22.0, "error_unseen": 0.3, "capped": 0}
+    numbers |= {"ssim": 0.5, "lpips_alex": 0.2}
+    other = {key: value * 1.1 for key, value in numbers.items()}
+    scenes = [entry("a", generated=numbers, plane=other)]
+    out = report.build({}, scenes, resamples=10)
+    header = report.table(out, ["gmsd", "psnr"]).splitlines()[1].split()
+    assert header == ["method", "gmsd", "psnr", "ssim", "lpips_alex"]
+    header = report.table(out).splitlines()[1].split()
+    assert header == ["method", "psnr", "ssim", "lpips_alex"]
+    shown = report.table(out, ["error_unseen"])
+    assert "*" not in "".join(shown.splitlines()[1:]) and "wins" not in shown
+    assert math.isnan(out["differences"]["generated"]["plane"]["error_unseen"]["wins"])
+    wins = out["differences"]["generated"]["plane"]["lpips_alex"]["wins"]
+    assert wins == 1.0

@@ -91,6 +91,17 @@ def test_enlarged_cuts_never_lie_between_two_surfaces():
     np.testing.assert_allclose(same, cut)
 
 
+def test_enlarged_edges_cut_corners():
+    """A slanted edge of cells has a finer one, closer to the line than the cells' own steps."""
+    y, x = np.mgrid[:24, :32] + 0.5
+    line = np.where(x + 0.6 * y < 22, 2.0, 9.0)
+    cells = np.where(x[::4, ::4] + 1.5 + 0.6 * (y[::4, ::4] + 1.5) < 22, 2.0, 9.0)
+    big = np.asarray(aggregate.enlarged(jnp.asarray(cells), 24, 32)).round(4)
+    steps = cells.repeat(4, 0).repeat(4, 1)
+    assert set(np.unique(big)) == {2.0, 9.0}
+    assert (big != line).mean() < (steps != line).mean()
+
+
 def test_a_pyramid_gives_means_of_what_is_finer():
     photos = RNG.random((2, 16, 24, 3)).astype(np.float32)
     pyramid = rendering.Pyramid.of(jnp.asarray(photos))
@@ -113,6 +124,16 @@ def test_a_pyramid_gives_means_of_what_is_finer():
     np.testing.assert_allclose(between, 0.75 * sharp + 0.25 * half, atol=1e-5)
 
 
+def whole(pictures: np.ndarray) -> rendering.Photos:
+    """Photos that show just what the model's H x W ones show."""
+    m, h, w, _ = pictures.shape
+    ones = np.ones((m, 1), np.float32)
+    scale = ones * np.array([h / H, w / W], np.float32)
+    coarse = pictures.reshape(m, H, h // H, W, w // W, 3).mean((2, 4))
+    size = ones * np.array([h, w], np.float32)
+    return rendering.Photos(*map(jnp.asarray, (pictures, coarse, size, scale, 0.0 * scale)))
+
+
 def plane(size: int):
     """A view and the two photos beside it of a textured plane: the view's picture at `size` times H x W, photos likewise,
     cameras at H x W, and the blend that knows the depth."""
@@ -124,8 +145,8 @@ def plane(size: int):
     scaled = K * np.array([size, size, 1.0], np.float32)[:, None]
     pictures = textured_plane(scaled, c2w, depth, size * H, size * W, 1.0 * size)
     blend = rendering.Blend(
-        cut=jnp.full((1, H, W), float(cut)),
-        reach=jnp.ones(1),
+        inverse=jnp.full((1, H, W), 1.0 / depth),
+        step=jnp.full(1, 0.1),
         share=jnp.full((1, 2, H, W, 1), 0.5),
         gate=jnp.full((1, H, W, 1), 0.5),
         head=jnp.full((1, H, W, 3), 0.5),
@@ -140,7 +161,7 @@ def test_a_known_surface_is_as_sharp_as_its_photos(size):
     pictures, way, blend = plane(size)
     scale = jnp.ones((1, 2))
     shown = rendering.render(
-        jnp.asarray(pictures[1:]), way, blend, scale, cuts=CUTS, height=size * H, width=size * W
+        whole(pictures[1:]), way, blend, scale, height=size * H, width=size * W
     )
     middle = np.s_[2 * size : -2 * size, 8 * size : -8 * size]
     off = np.abs(np.asarray(shown[0]) - pictures[0])[middle]
@@ -151,15 +172,39 @@ def test_a_known_surface_is_as_sharp_as_its_photos(size):
         assert off.mean() < 0.5 * blurred.mean()
 
 
+def test_what_the_model_is_not_shown_of_a_photo_is_read_too():
+    """Whole photos with more around the model's window give the same picture, and more of it."""
+    pictures, way, blend = plane(1)
+    K, c2w = (x[[0]] for x in side_by_side(3, 0.15))
+    top, left, extra = 3, 9, 40
+    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(8), CUTS))
+    wider = K + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]], np.float32)
+    photo = textured_plane(wider, c2w, depth, H + 6, W + extra)
+    size, offset, one = (
+        np.array([x], np.float32) for x in ((H + 6, W + extra), (top, left), (1, 1))
+    )
+    more = rendering.Photos(*map(jnp.asarray, (photo, photo, size, one, offset)))
+    way = sweep.Motion(way.turn[:, :1], way.shift[:, :1])
+    blend = blend._replace(share=jnp.ones((1, 1, H, W, 1)))
+    shape = {"height": H, "width": W}
+    cut, uncut = (
+        np.asarray(rendering.render(x, way, blend, jnp.ones((1, 1)), **shape))[0]
+        for x in (whole(pictures[1:2]), more)
+    )
+    np.testing.assert_allclose(uncut[:, :-18], cut[:, :-18], atol=0.03)
+    off = [np.abs(x - pictures[0])[:, -12:].mean() for x in (cut, uncut)]
+    assert off[1] < 0.1 * off[0]  # where the window ends and the photo does not
+    np.testing.assert_allclose(more.shrunk().offset, offset)
+
+
 def test_where_no_photo_sees_anything_the_mixture_stays():
     pictures, way, blend = plane(1)
     away = sweep.Motion(-way.turn, -way.shift)  # everything lies behind the photos
     shown = rendering.render(
-        jnp.asarray(pictures[1:]),
+        whole(pictures[1:]),
         away,
         blend,
         jnp.ones((1, 2)),
-        cuts=CUTS,
         height=2 * H,
         width=2 * W,
     )
@@ -169,9 +214,7 @@ def test_where_no_photo_sees_anything_the_mixture_stays():
 def test_photos_that_disagree_leave_the_picture_to_the_mixture():
     pictures, way, blend = plane(1)
     photos = np.stack([np.zeros_like(pictures[1]), np.ones_like(pictures[2])])
-    shown = rendering.render(
-        jnp.asarray(photos), way, blend, jnp.ones((1, 2)), cuts=CUTS, height=H, width=W
-    )
+    shown = rendering.render(whole(photos), way, blend, jnp.ones((1, 2)), height=H, width=W)
     middle = np.asarray(shown)[0, 2:-2, 18:-18]
     np.testing.assert_allclose(middle, 0.5, atol=0.02)
 
@@ -188,7 +231,7 @@ def test_look_up_gives_the_picture_at_both_sizes():
     features = RNG.standard_normal((1, H // 8, W // 8, D)).astype(np.float32)
     head = jnp.full((1, H, W, 3), 0.5)
     given = (p, features, head, jnp.asarray(photos[1:]), (K[:1], c2w[:1]), (K[1:], c2w[1:]))
-    full = lookup.Full(jnp.asarray(big[1:]), 3 * H, 3 * W)
+    full = lookup.Full(whole(big[1:]), 3 * H, 3 * W)
     both = jax.jit(
         lambda *a, photos: lookup.look_up(*a, cuts=CUTS, full=full._replace(photos=photos))
     )(*given, photos=full.photos)
