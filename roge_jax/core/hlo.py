@@ -186,7 +186,9 @@ def _work(one: Instruction, others) -> tuple[str, float]:
     if called.startswith("__cublas") and first:
         axis = re.search(r'lhs_contracting_dimensions":\s*\["?(\d+)', one.line)
         summed = first[0].shape[int(axis[1])] if axis else 1
-        return first[0].dtype, 2.0 * max(math.prod(x.shape) for x in one.results) * summed
+        return first[0].dtype, 2.0 * math.prod(
+            one.results[0].shape
+        ) * summed  # beside it: workspace
     if "fmha" in called and first:
         scores = re.search(r'"dimensions":\s*\[([^\]]*)\]', one.line)
         size = math.prod(int(x) for x in re.findall(r"\d+", scores[1])) if scores else 0

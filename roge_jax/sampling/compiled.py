@@ -24,7 +24,10 @@ def compiled_window(
     dtype: str = "bfloat16",
     pieces: tuple[str, ...] = PIECES,
 ) -> dict[str, aot.Compiled]:
-    """`programs.for_window` of m photos, random weights not even drawn, on a mesh of `sizes` of targets `name`."""
+    """`programs.for_window` of m photos, random weights not even drawn, on a mesh of `sizes` of targets `name`.
+
+    Pictures are those of the model's own size: whole photos, of which larger ones are made, are left out.
+    """
     with aot.compiling(name, sizes) as mesh:
         whole = sharding.replicated(mesh)
 

@@ -203,11 +203,17 @@ def _modulate(x: jax.Array, shift: jax.Array, scale: jax.Array) -> jax.Array:
     return layer_norm({}, x, eps=EPS) * lift(1.0 + scale, x.ndim) + lift(shift, x.ndim)
 
 
+def by_tokens(x: jax.Array) -> jax.Array:
+    """Tokens [l, d] before they turn into heads. Left to itself XLA sends whole tokens to the products, and their
+    gradient back in float32."""
+    return constrain(x, ("tokens", None))
+
+
 def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> jax.Array:
     """Attention of tokens [l, d] over themselves; q and k are normalised over the full width, then rotated."""
-    q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
-    k = split_heads(rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS), heads)
-    v = split_heads(linear(p["v"], x), heads)
+    q = rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS)
+    k = rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS)
+    q, k, v = (split_heads(by_tokens(y), heads) for y in (q, k, linear(p["v"], x)))
     dtype = p["q"]["kernel"].dtype
     q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v, dtype)
     y = merge_heads(attention(q, k, v, dtype=dtype, over="attention_heads"))
@@ -217,7 +223,8 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
 def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array:
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
     dtype = p["q"]["kernel"].dtype
-    q = split_heads(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS), heads)
+    q = by_tokens(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS))
+    q = split_heads(q, heads)
 
     def read(k, v):
         return attention(*by_heads(q, k, v, dtype), dtype=dtype, over="attention_heads")

@@ -39,7 +39,7 @@ ENTRY %main (p: bf16[16,8], w: bf16[8,4]) -> f32[16,4] {
   %w = bf16[8,4]{1,0} parameter(1)
   %start = (s32[], bf16[16,8]{1,0}, bf16[8,4]{1,0}) tuple(%p, %w)
   %loop = (s32[], bf16[16,8]{1,0}, bf16[8,4]{1,0}) while(%start), condition=%region_0, body=%body, backend_config={"known_trip_count":{"n":"5"}}
-  %lt = (f32[16,4]{1,0}, s8[64]{0}) custom-call(%p, %w), custom_call_target="__cublas$lt$matmul", backend_config={"dot_dimension_numbers":{"lhs_contracting_dimensions":["1"]}}
+  %lt = (f32[16,4]{1,0}, s8[4096]{0}) custom-call(%p, %w), custom_call_target="__cublas$lt$matmul", backend_config={"dot_dimension_numbers":{"lhs_contracting_dimensions":["1"]}}
   %image = f32[1,6,6,2]{3,2,1,0} parameter(2)
   %kernel = f32[3,3,2,5]{3,2,1,0} parameter(3)
   %conv = f32[1,6,6,5]{3,2,1,0} convolution(%image, %kernel), window={size=3x3 pad=1_1x1_1}, dim_labels=b01f_01io->b01f
