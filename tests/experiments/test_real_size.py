@@ -221,10 +221,10 @@ def test_the_difference_of_bfloat16_sees_attention(monkeypatch):
     from roge_jax.recon import ray_scene, vggt
     from roge_jax.video import dit
 
-    def uniform(q, k, v, *, dtype):
+    def uniform(q, k, v, *, dtype, **options):
         if dtype == jnp.bfloat16:
             q = jnp.zeros_like(q)
-        return attention(q, k, v, dtype=dtype)
+        return attention(q, k, v, dtype=dtype, **options)
 
     attention = dit.attention
     for part, module in (("dit", dit), ("encoder", vggt), ("rays", ray_scene)):
