@@ -65,8 +65,8 @@ format: $(DEV)  ## let ruff order imports and lay out the code
 	$(VENV)/bin/ruff format $(CODE)
 
 figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/figures.md has single ones)
-	$(RUN) -m roge_jax.evaluate --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
-	$(RUN) -m roge_jax.evaluate --sweep 100 130 --out experiments/results/mini_wide.json
+	$(RUN) -m roge_jax.evaluate --size 64x112 --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
+	$(RUN) -m roge_jax.evaluate --sweep 100 130 --size 64x112 --out experiments/results/mini_wide.json
 	$(RUN) -m roge_jax.procedural sheet --out docs/procedural.png
 	$(RUN) -m $(DRAWN) --draw
 	@for f in $(FIGURES); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
