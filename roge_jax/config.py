@@ -50,6 +50,9 @@ class RendererConfig:
     relative_cameras: bool = False  # projective; "full" attention has no such form
     # Cuts along every ray at which it looks into the photos themselves; 0: it sees scene tokens alone.
     lookup: int = 0
+    matching: bool = (
+        False  # learned features compare the photos, where the picture may be larger than the model
+    )
     chunk: int = 8  # views processed at a time
     merge: Literal[1, 2, 4] = 1  # scene tokens of a photo averaged into one: 2 in a row, 2 x 2
 
@@ -285,6 +288,7 @@ def _mini() -> RoGeConfig:
             attention="cross",
             relative_cameras=True,
             lookup=48,
+            matching=True,
             chunk=32,
         ),
         vae=VAEConfig(base=16),

@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
         default="lora",
         help="lora (default): LoRA on both halves + new embeddings, the paper's joint training;\n"
         "hires: the same with the reconstruction frozen, at --size;\n"
-        "vae_images, vae_clips, vae_longer, recon_low, recon, lookup, prior, generator, vae_decoder, joint: one stage\n"
+        "vae_images, vae_clips, vae_longer, recon_low, recon, lookup, match, prior, generator, vae_decoder, joint: one stage\n"
         "of the recipe that makes a small model from nothing; all: these in order, then lora, then hires",
     )
     p.add_argument(
@@ -225,8 +225,8 @@ def choose(args: argparse.Namespace, cfg):
 
     if args.stage == "hires" or args.size:
         cfg = start.resize(cfg, args.size, hires=args.stage == "hires")
-    side = min(cfg.height, cfg.width)
-    recipe = stages_.mini_stages(args.scale, frames=cfg.frames, side=side)
+    size = (cfg.height, cfg.width)
+    recipe = stages_.mini_stages(args.scale, frames=cfg.frames, size=size)
     for hires in (False, True):
         steps = max(1, round(200 * args.scale))
         stage = stages_.lora_stage(steps, frames=cfg.frames, hires=hires)
@@ -239,6 +239,13 @@ def choose(args: argparse.Namespace, cfg):
                 "0): start from one that has, such as --init mini, or from scratch."
             )
         recipe = [stage for stage in recipe if not stage.lookup]
+    if not (cfg.renderer.lookup and cfg.renderer.matching):
+        if args.stage == "match":
+            raise UserError(
+                f"--stage match trains the features that photos are matched by, and this model of '{cfg.name}' has none "
+                "(renderer.matching is false): start from one that has, such as --init mini, or from scratch."
+            )
+        recipe = [stage for stage in recipe if stage.objective != "match"]
     chosen = recipe if args.stage == "all" else [stages_.find_stage(recipe, args.stage)]
     changes = {"steps": args.steps, "batch": args.batch}
     changes = {k: v for k, v in changes.items() if v}

@@ -16,6 +16,7 @@ import time
 import zipfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -66,16 +67,18 @@ def write_pool(
     depth: bool = False,
     varied: bool = False,
     handheld: bool = False,
+    textures: Path | None = None,
 ) -> None:
     """Render `sample_sequence` of every seed into a pool with one-thread worker processes.
 
-    Finished shards are kept, so an interrupted call is resumed by repeating it.
+    With `textures`, a folder of pictures, every shard has a set of its own (`load_textures`). Finished shards are kept, so an interrupted call is resumed by repeating it.
 
     Raises:
         UserError: no seeds, seeds of both splits, a folder that holds a pool with other settings
             or that another process is writing.
     """
     from roge_jax.procedural.scenes import HELDOUT_SEED, split_of
+    from roge_jax.procedural.textures import folder_pictures
 
     path = Path(path)
     wanted = np.asarray(seeds, np.int64)
@@ -86,9 +89,17 @@ def write_pool(
             f"{path}: seeds {wanted.min()} .. {wanted.max()} mix training and held-out scenes; "
             f"write seeds from {HELDOUT_SEED} on into a pool of their own."
         )
-    settings = {"frames": frames, "height": height, "width": width, "supersample": supersample}
+    settings: dict[str, Any] = {
+        "frames": frames,
+        "height": height,
+        "width": width,
+        "supersample": supersample,
+    }
     settings |= {"scenes_per_shard": scenes_per_shard, "depth": depth, "varied": varied}
     settings |= {"first_seed": int(wanted[0])} | ({"handheld": True} if handheld else {})
+    if textures is not None:
+        folder_pictures(textures, split_of(int(wanted[0])))  # says what is wrong with the folder
+        settings["textures"] = str(textures)
     path.mkdir(parents=True, exist_ok=True)
     with _sole_writer(path):
         _write_missing(path, wanted, settings, processes)
@@ -173,10 +184,17 @@ def _is_complete(stem: Path, seeds: np.ndarray) -> bool:
 
 
 def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
-    from roge_jax.procedural.scenes import sample_sequence
+    import jax.numpy as jnp
+
+    from roge_jax.procedural.scenes import sample_sequence, split_of
+    from roge_jax.procedural.textures import load_textures
 
     stem, seeds, settings = job
     began = time.perf_counter()
+    textures = None
+    if "textures" in settings:  # another draw for every shard
+        folder, draw = Path(settings["textures"]), 1 + int(stem.name.rpartition("_")[2])
+        textures = jnp.asarray(load_textures(split_of(int(seeds[0])), folder, draw))
     f, h, w = (settings[name] for name in ("frames", "height", "width"))
     depth = settings["depth"]
     kinds = {"rgb": (np.uint8, (f, h, w, 3))} | (
@@ -199,6 +217,7 @@ def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
             depth=depth,
             varied=settings["varied"],
             handheld=settings.get("handheld", False),
+            textures=textures,
         )
         for name, store in maps.items():
             store[row] = views[name]

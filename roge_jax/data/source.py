@@ -9,8 +9,8 @@ from .pool import read_pool
 class ProceduralSource:
     """Endless sequences of `frames` varied views [height, width]; item i is scene seed i of the training split."""
 
-    def __init__(self, height: int, width: int, frames: int):
-        self.height, self.width, self.frames = height, width, frames
+    def __init__(self, height: int, width: int, frames: int, depth: bool = False):
+        self.height, self.width, self.frames, self.depth = height, width, frames, depth
 
     def __len__(self) -> int:
         return 10**9  # held-out seeds begin here
@@ -23,21 +23,27 @@ class ProceduralSource:
             height=self.height,
             width=self.width,
             frames=self.frames,
-            depth=False,
+            depth=self.depth,
             varied=True,
         )
 
 
-def open_source(folder: Path | None, height: int, width: int, window: int):
+def open_source(folder: Path | None, height: int, width: int, window: int, depth: bool = False):
     """Sequences to draw training samples of `window` targets at height x width from: the pool in `folder`, or
     procedural ones.
 
+    With `depth`, sequences have it.
+
     Raises:
-        UserError: the pool's frames are not that size or a whole multiple of it, or are fewer than the window.
+        UserError: the pool has no depth, or its frames are not that size or a whole multiple of it, or are fewer than the window.
     """
     if folder is None:
-        return ProceduralSource(height, width, frames=max(24, window + 3))
+        return ProceduralSource(height, width, frames=max(24, window + 3), depth=depth)
     pool = read_pool(folder)
+    if depth and not pool.depth:
+        raise UserError(
+            f"{folder}: its scenes have no depth, which this stage learns from: render the pool with --depth."
+        )
     frames, h, w = pool[0]["rgb"].shape[:3]
     if h % height or w % width or h // height != w // width:
         raise UserError(

@@ -26,6 +26,7 @@ class ViewConfig:
     augment: bool = True
     faults: float = 0.0  # probability that photos have those of a capture (`faults.captured`)
     size: tuple[int, int] | None = None  # height, width; None: as stored
+    depth: bool = False  # samples carry the depth of all views
 
     def undisturbed(self) -> "ViewConfig":
         """The same for scoring: views from the whole path, pictures and cameras as they are."""
@@ -55,14 +56,20 @@ def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):
     return contexts, window if rng.random() < 0.5 else window[::-1]
 
 
-def alter(rng: np.random.Generator, rgb: np.ndarray, K: np.ndarray, c2w: np.ndarray):
+def alter(
+    rng: np.random.Generator,
+    rgb: np.ndarray,
+    K: np.ndarray,
+    c2w: np.ndarray,
+    depth: np.ndarray | None = None,
+):
     """One random mirror, colour permutation, inversion, gamma and saturation for all views of a sample.
 
     rgb [v, h, w, 3] in [0, 1]. A mirrored scene is a valid scene: pixels flip, cx moves, and the poses are
     conjugated by diag(-1, 1, 1, 1), which keeps det R = +1.
     """
     if rng.random() < 0.5:
-        rgb = rgb[:, :, ::-1]
+        rgb, depth = rgb[:, :, ::-1], None if depth is None else depth[:, :, ::-1]
         flip = np.diag([-1.0, 1.0, 1.0, 1.0])
         c2w, K = flip @ c2w @ flip, K.copy()
         K[:, 0, 2] = rgb.shape[2] - K[:, 0, 2]
@@ -72,7 +79,20 @@ def alter(rng: np.random.Generator, rgb: np.ndarray, K: np.ndarray, c2w: np.ndar
         rgb = 1.0 - rgb
     grey = rgb.mean(-1, keepdims=True)
     rgb = grey + rng.uniform(0.3, 1.8) * (rgb - grey)
-    return np.clip(rgb, 0.0, 1.0) ** rng.uniform(0.7, 1.4), K, c2w
+    return np.clip(rgb, 0.0, 1.0) ** rng.uniform(0.7, 1.4), K, c2w, depth
+
+
+def _depth_of(sequence: dict, views: np.ndarray, size: tuple[int, int] | None, number: int):
+    """Depth of views [v, h, w] at `size`, each pixel that of the middle of its block."""
+    if "depth" not in sequence:
+        raise UserError(
+            f"Sequence {number} of the data has no depth, which this stage learns from: render the pool with --depth."
+        )
+    depth = np.asarray(sequence["depth"][views], np.float32)
+    if size is not None:
+        fy, fx = depth.shape[1] // size[0], depth.shape[2] // size[1]
+        depth = depth[:, fy // 2 :: fy, fx // 2 :: fx]
+    return depth
 
 
 def average_down(rgb: np.ndarray, K: np.ndarray, size: tuple[int, int] | None):
@@ -90,17 +110,20 @@ def average_down(rgb: np.ndarray, K: np.ndarray, size: tuple[int, int] | None):
     return x.reshape(v, size[0], fy, size[1], fx, c).mean((2, 4)), K
 
 
-def make_sample(rgb, K, c2w, m: int, *, scale_rule: str) -> dict[str, np.ndarray]:
+def make_sample(
+    rgb, K, c2w, m: int, *, scale_rule: str, depth: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Views [m + n] (contexts first) as the arrays the model takes, normalised to the first context.
 
     Returns context_rgb [m, h, w, 3], target_rgb [n, h, w, 3] float32 in [0, 1], K [m + n, 3, 3] in pixels,
-    c2w [m + n, 4, 4], vectors [m, 11].
+    c2w [m + n, 4, 4], vectors [m, 11]; given z-depth [m + n, h, w] also that, in the normalised unit.
     """
     h, w = rgb.shape[1:3]
     context, target, info = normalise(
         Cameras(K[:m], c2w[:m]), Cameras(K[m:], c2w[m:]), rule=scale_rule
     )
-    return {
+    measured = {} if depth is None else {"depth": (depth / info.divisor).astype(np.float32)}
+    return measured | {
         "context_rgb": rgb[:m].astype(np.float32),
         "target_rgb": rgb[m:].astype(np.float32),
         "K": np.concatenate([context.K, target.K]).astype(np.float32),
@@ -134,14 +157,15 @@ def draw_batch(
         views = np.concatenate([contexts, targets])
         rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
         c2w = np.asarray(sequence["c2w"][views], np.float64)
+        depth = _depth_of(sequence, views, cfg.size, number) if cfg.depth else None
         if cfg.augment:
-            rgb, K, c2w = alter(rng, rgb, K, c2w)
+            rgb, K, c2w, depth = alter(rng, rgb, K, c2w, depth)
         if cfg.faults and rng.random() < cfg.faults:
             photos, cameras = captured(rgb[:m].astype(np.float32), Cameras(K[:m], c2w[:m]), rng)
             rgb, K = np.concatenate([photos, rgb[m:]]), np.concatenate([cameras.K, K[m:]])
             c2w = np.concatenate([cameras.c2w, c2w[m:]])
         try:
-            samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule))
+            samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule, depth=depth))
         except UserError as error:
             chosen = ", ".join(str(view) for view in views)
             raise UserError(f"Sequence {number} of the data, frames {chosen}: {error}") from error

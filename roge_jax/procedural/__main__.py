@@ -79,6 +79,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     pool.add_argument("--first-seed", type=number(), default=0)
     pool.add_argument("--processes", type=number(1), default=os.cpu_count() or 1)
     pool.add_argument("--scenes-per-shard", type=number(1), default=100)
+    pool.add_argument(
+        "--textures",
+        type=Path,
+        help="a folder of pictures to cut textures from, beside the built-in ones; a tenth of their kinds (names up to the "
+        "last _) is held out",
+    )
     pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
     pool.add_argument(
         "--varied",
@@ -123,6 +129,7 @@ def _run(args: argparse.Namespace) -> None:
             depth=args.depth,
             varied=training if args.varied is None else args.varied,
             handheld=args.handheld,
+            textures=args.textures,
         )
     elif args.command == "sheet":
         seeds = range(args.first_seed, args.first_seed + args.scenes)

@@ -307,6 +307,7 @@ def sample_sequence(
     depth: bool = True,
     varied: bool = False,
     handheld: bool = False,
+    textures: Array | None = None,
 ) -> dict[str, np.ndarray]:
     """The views of one scene along one smooth path.
 
@@ -315,6 +316,7 @@ def sample_sequence(
         varied: the training distribution: orbits and lenses of `varied_cameras` in place of `sweep` and one
             centred lens of 45 to 75 degrees.
         handheld: the cameras of `handheld_cameras` in place of `sweep`; with `varied` its lenses.
+        textures: another set of `load_textures` than the split's own.
 
     Returns:
         `rgb` uint8 `[f,h,w,3]`, `depth` float32 `[f,h,w]` (z-depth; sky `SKY_DEPTH`; absent with
@@ -323,7 +325,8 @@ def sample_sequence(
     Raises:
         UserError: the seed is outside 0 .. 2^31 - 1.
     """
-    textures = _device_textures(split_of(seed))
+    if textures is None:
+        textures = _device_textures(split_of(seed))
     rgb, z, K, c2w = _sequence(
         np.int32(seed),
         textures,

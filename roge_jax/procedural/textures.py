@@ -8,6 +8,7 @@ share neither photographs nor noise seeds.
 
 import functools
 import itertools
+from pathlib import Path
 
 import numpy as np
 
@@ -27,29 +28,77 @@ PHOTO_NAMES = {
     "heldout": ("chelsea", "coffee", "coins"),
 }
 NOISE_SEEDS = {"train": 1, "heldout": 1_000_001}
+PICTURES = (".jpg", ".jpeg", ".png", ".webp")
+OF_FOLDER = 100  # pictures of a folder in one set, beside the photographs
 
 
 @functools.cache
-def load_textures(split: str = "train") -> np.ndarray:
+def load_textures(split: str = "train", folder: Path | None = None, draw: int = 0) -> np.ndarray:
     """The packed texture set of a split, `uint32 [PHOTOS + NOISES, TEXELS]`; cached, read-only.
 
     Args:
         split: "train" or "heldout".
+        folder: pictures of any kind and size that most photographic textures are cut from instead
+            (`folder_pictures`).
+        draw: which of endlessly many such sets.
 
     Raises:
-        UserError: the split is neither.
+        UserError: the split is neither, or the folder has no picture for it.
     """
     from roge_jax.errors import UserError, did_you_mean
 
     if split not in PHOTO_NAMES:
         raise UserError(f"texture split '{split}' is unknown: {did_you_mean(split, PHOTO_NAMES)}")
-    rng = np.random.default_rng(NOISE_SEEDS[split])
+    rng = np.random.default_rng([NOISE_SEEDS[split], draw] if draw else NOISE_SEEDS[split])
     photos = _photographs(PHOTO_NAMES[split])
+    if folder is not None:
+        found = folder_pictures(folder, split)
+        chosen = rng.choice(len(found), min(len(found), OF_FOLDER), replace=False)
+        photos += [_read_picture(found[i]) for i in chosen]
     rows = [_photo_texture(rng, photos) for _ in range(PHOTOS)]
     rows += [_noise_texture(rng, kind=i % len(_KINDS)) for i in range(NOISES)]
     packed = np.stack([_pack(_mip_levels(row)) for row in rows])
     packed.setflags(write=False)
     return packed
+
+
+def folder_pictures(folder: Path, split: str) -> list[Path]:
+    """The pictures in a folder and its folders that a split may use: a tenth of the kinds is held out.
+
+    Pictures are of one kind if their names agree up to the last `_`: `Bricks_000.jpg`, `Bricks_001.jpg`.
+    """
+    from roge_jax.errors import UserError
+
+    files = [p for p in sorted(Path(folder).rglob("*")) if p.suffix.lower() in PICTURES]
+    kinds = sorted({_kind(path) for path in files})
+    heldout = set(kinds[9::10])
+    chosen = [path for path in files if (_kind(path) in heldout) == (split == "heldout")]
+    if not chosen:
+        raise UserError(
+            f"{folder}: no picture for the {split} textures: give a folder of {', '.join(PICTURES)} files, of ten kinds "
+            "or more for held-out scenes."
+        )
+    return chosen
+
+
+def _kind(path: Path) -> str:
+    return path.stem.rpartition("_")[0] or path.stem
+
+
+def _read_picture(path: Path) -> np.ndarray:
+    """A picture as float32 `[h, w, 3]` in [0, 1], small ones mirrored at their borders up to `SIDE` pixels."""
+    from PIL import Image, UnidentifiedImageError
+
+    from roge_jax.errors import UserError
+
+    try:
+        with Image.open(path) as opened:
+            opened.thumbnail((4 * SIDE, 4 * SIDE))
+            image = np.asarray(opened.convert("RGB"), np.float32) / 255
+    except (OSError, UnidentifiedImageError) as error:
+        raise UserError(f"{path} cannot be read as a picture ({error}): remove it.") from error
+    missing = [(0, max(0, SIDE - side)) for side in image.shape[:2]]
+    return np.pad(image, [*missing, (0, 0)], mode="symmetric")
 
 
 def _photographs(names: tuple[str, ...]) -> list[np.ndarray]:

@@ -1,22 +1,23 @@
 """Which cut of a ray is right, from all of a view's rays together: semi-global aggregation of what photos and network say.
 
 The look-up decides cell by cell (`recon.lookup`), and where neighbours disagree its cuts jump from pixel to pixel. Here
-every pixel has a cost for each cut, how much the photos differ there less what the network believes, and cuts of
-neighbours that differ cost as well (Hirschmueller 2008, four directions). Nothing in here is trained.
+every pixel has a cost for each cut, from how well the photos match there (`recon.matching`) and what the network
+believes, and cuts of neighbours that differ cost as well (Hirschmueller 2008, four directions). Nothing in here is trained.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-DIFFERENCE = 0.05  # difference of colours that counts as another thing
-STRUCTURE = 0.05  # weight of the normalised luma's difference beside colours
 RADIUS = 3  # pixels about which luma is normalised
-WINDOW = 2  # pixels about which costs are averaged
-BELIEF = 0.1  # cost of a factor e in the network's probability
-LEAST = -12.0  # its logarithm is not taken for less
-HIDDEN = 1.0  # further cost of cuts that no photo sees
-STEP, JUMP = 0.04, 0.3  # cost of a neighbour one cut, and more than one cut, away
+BELIEF = 1.0  # weight of the network's logarithmic probability beside the evidence
+LEAST = -12.0  # it is not taken for less
+HIDDEN = 20.0  # further cost of cuts that no photo sees
+STEP, JUMP = 0.8, 6.0  # cost of a neighbour one cut, and more than one cut, away
+AROUND, BEYOND = (
+    2,
+    1.5,
+)  # the range of a finer level: coarse answers so many pixels around, and steps more
 TAIL, MARGIN = 0.02, 1.2  # of inverse depths: left out at either end, and added again
 TOGETHER = 1.5  # cuts by which neighbours on one surface differ at most
 
@@ -38,28 +39,6 @@ def box(x: jax.Array, radius: int) -> jax.Array:
         parts = [jax.lax.slice_in_dim(x, i, i + n, axis=axis) for i in range(side)]
         x = jnp.stack(parts).mean(0)
     return x
-
-
-def difference(values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Array:
-    """How much the photos differ at cuts [k, p]: values [m, k, p, 4] of `with_structure`, seen [m, k, p].
-
-    A soft minimum over pairs of photos from different places (`alike`: `sweep.twins`), since one of a pair may look at
-    something in front. Where no pair sees a cut, half of what strangers cost.
-    """
-    close, pairs = jnp.zeros(seen.shape[1:]), jnp.zeros(seen.shape[1:])
-    channels = [
-        values[..., c] for c in range(4)
-    ]  # sums along a last axis of four take ten times as long
-    for i in range(len(values)):
-        for j in range(i):
-            red, green, blue, structure = (jnp.abs(x[i] - x[j]) for x in channels)
-            cost = (red + green + blue) / 3.0 + STRUCTURE * jnp.minimum(structure, 2.0)
-            both = seen[i] * seen[j] * (1.0 - alike[i, j])
-            close += both * jnp.exp(-cost / DIFFERENCE)
-            pairs += both
-    most = -DIFFERENCE * float(np.log(1e-4))
-    cost = -DIFFERENCE * jnp.log(close / jnp.maximum(pairs, 1e-6) + 1e-4)
-    return jnp.where(pairs > 0.5, cost, 0.5 * most)
 
 
 def semi_global(cost: jax.Array) -> jax.Array:
@@ -97,16 +76,29 @@ def cheapest(cost: jax.Array) -> jax.Array:
     return k + jnp.where((k > 0) & (k < most) & (bend > 1e-6), step, 0.0)
 
 
-def settled(
-    values: jax.Array, seen: jax.Array, alike: jax.Array, belief: jax.Array, h: int, w: int
-) -> jax.Array:
-    """The cut of every pixel [h, w]: values [m, k, h w, 4] of `with_structure` at all cuts, seen [m, k, h w], and the
+def with_belief(evidence: jax.Array, seen: jax.Array, belief: jax.Array | None = None) -> jax.Array:
+    """Costs [k, h, w] of cuts from evidence [k, h, w] (logits), the number of photos that see them [k, h, w], and the
     network's logits over the cuts of cells `belief` [k, ch, cw]."""
-    size = (len(belief), h, w)
-    cost = box(difference(values, seen, alike).reshape(size), WINDOW)
-    believed = jax.image.resize(jax.nn.log_softmax(belief, 0), size, "linear")
-    cost = cost - BELIEF * jnp.maximum(believed, LEAST)
-    return cheapest(semi_global(cost + HIDDEN * (seen.max(0).reshape(size) <= 0)))
+    cost = HIDDEN * (seen <= 0) - evidence
+    if belief is None:
+        return cost
+    believed = jax.image.resize(jax.nn.log_softmax(belief, 0), cost.shape, "linear")
+    return cost - BELIEF * jnp.maximum(believed, LEAST)
+
+
+def envelope(
+    low: jax.Array, high: jax.Array, height: int, width: int
+) -> tuple[jax.Array, jax.Array]:
+    """Bounds [height, width] of the inverse depth of a pixel from those of a coarser level [h, w]: the least and the
+    largest of the pixels `AROUND`. Both vary smoothly, so that labels of neighbours can be compared."""
+    side = 2 * AROUND + 1
+    window, ones = (side, side), (1, 1)
+    low = jax.lax.reduce_window(low, jnp.inf, jax.lax.min, window, ones, "SAME")
+    high = jax.lax.reduce_window(high, -jnp.inf, jax.lax.max, window, ones, "SAME")
+    size = (height, width)
+    return jax.image.resize(box(low, 1), size, "linear"), jax.image.resize(
+        box(high, 1), size, "linear"
+    )
 
 
 def occupied(inverse: jax.Array, count: int) -> jax.Array:
@@ -114,13 +106,6 @@ def occupied(inverse: jax.Array, count: int) -> jax.Array:
     low, high = jnp.quantile(inverse, jnp.asarray([TAIL, 1.0 - TAIL]))
     low, high = low / MARGIN, jnp.maximum(high * MARGIN, low / MARGIN + 1e-3)
     return low + (high - low) * jnp.arange(count) / (count - 1)
-
-
-def at_cuts(belief: jax.Array, cut: jax.Array) -> jax.Array:
-    """Logits [k, ch, cw] over whole cuts at others [j], between two of them in proportion."""
-    cut = jnp.clip(cut, 0.0, len(belief) - 1.0)
-    apart = jnp.abs(cut[:, None] - jnp.arange(len(belief), dtype=jnp.float32)[None])
-    return jnp.einsum("jk,kyx->jyx", jnp.maximum(1.0 - apart, 0.0), belief)
 
 
 def enlarged(

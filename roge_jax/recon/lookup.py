@@ -31,7 +31,8 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
-from .aggregate import at_cuts, occupied, settled, with_structure
+from .depth import FINER, Level, surfaces
+from .matching import matching_specs
 from .rendering import Blend, Photos, render
 from .sweep import (
     EPS,
@@ -80,8 +81,8 @@ class Looked(NamedTuple):
     )
 
 
-def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
-    """Leaves for ray features of width `d`, `patch` pixels a side."""
+def lookup_specs(d: int, patch: int, cuts: int, matching: bool = False) -> Tree:
+    """Leaves for ray features of width `d`, `patch` pixels a side; with those of `recon.matching` or without."""
     cells, linears = (patch // CELL) ** 2, (None, None)
     along = {
         "kernel": Spec((ALONG, WIDTH, WIDTH), (None,) * 3, fan_in(0.5)),
@@ -110,6 +111,7 @@ def lookup_specs(d: int, patch: int, cuts: int) -> Tree:
             "conv2": conv2d_specs(WIDTH, WIDTH, 3),
             "conv3": conv2d_specs(WIDTH, 4, 3, init=zeros),
         },
+        **({"match": matching_specs()} if matching else {}),
     }
 
 
@@ -151,8 +153,11 @@ def look_up(
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
     alike = twins(photo_cameras[1])
-    wide = None if full is None else full.photos.shrunk()
-    structured = None if wide is None else with_structure(wide.rgb)
+    match = p.get("match")
+    wide, levels = None, None
+    if full is not None:
+        wide = full.photos.shrunk()
+        levels = Level.of(match, wide), Level.of(match, full.photos.shrunk(FINER))
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
@@ -174,28 +179,19 @@ def look_up(
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         looked, _, (mixed, _, _) = choose(cut, found, seen)
         own = Looked(mixed, head, looked, coarse)
-        if wide is None:
+        if wide is None or levels is None:
             return own, None
         h, w = photos.shape[1:3]
-        where, size = pixels_of(h, w, 1), (wide.size[:, 0], wide.size[:, 1])
-        way = wide.into(way)
-
-        def agreed(inverse, belief):
-            many = jnp.broadcast_to(inverse[:, None], (len(inverse), h * w))
-            values, seen = fetch(structured, way, where, many, size)
-            return settled(values, seen, alike, belief, h, w)
-
-        # All depths that photos share, then as many again where the view's surfaces are.
-        cut = agreed(inverse_depth(jnp.arange(cuts, dtype=jnp.float32), cuts, reach), belief)
-        near = occupied(inverse_depth(cut, cuts, reach), cuts)
-        step = near[1] - near[0]
-        inverse = near[0] + step * agreed(near, at_cuts(belief, cut_at(near, cuts, reach)))
-        cut = cut_at(inverse, cuts, reach)
+        inverse, step = surfaces(match, levels, way, belief, reach, alike, (h, w))
+        near = inverse[FINER // 2 :: FINER, FINER // 2 :: FINER]
         found, seen = (
             x.reshape(len(x), h, w, -1)
-            for x in fetch(wide.rgb, way, where, inverse.reshape(1, -1), size)
+            for x in fetch(
+                *(wide.rgb, wide.into(way), pixels_of(h, w, 1), near.reshape(1, -1)),
+                size=(wide.size[:, 0], wide.size[:, 1]),
+            )
         )
-        _, share, (_, gate, rest) = choose(cut, found, seen)
+        _, share, (_, gate, rest) = choose(cut_at(near, cuts, reach), found, seen)
         return own, Blend(inverse, step, share, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])

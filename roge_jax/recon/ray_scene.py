@@ -205,7 +205,7 @@ def renderer_specs(cfg: RendererConfig) -> Tree:
         },
     }
     if cfg.lookup:
-        specs["lookup"] = lookup_specs(d, cfg.patch, cfg.lookup)
+        specs["lookup"] = lookup_specs(d, cfg.patch, cfg.lookup, cfg.matching)
     if cfg.attention == "bidirectional":
         specs["blocks"] = stack(bidirectional_block_specs(d, heads, depth), depth - 1)
         specs["last_block"] = cross_block_specs(d, heads, depth)

@@ -28,12 +28,17 @@ class Photos(NamedTuple):
     scale: Array  # [m, 2] pixels of `rgb` in one of the model's, down and across
     offset: Array  # [m, 2] where the window begins in `rgb`
 
-    def shrunk(self) -> "Photos":
-        """The coarse ones in place of `rgb`."""
-        sides = zip(self.coarse.shape[1:3], self.rgb.shape[1:3], strict=True)
+    def shrunk(self, times: int = 1) -> "Photos":
+        """The coarse ones in place of `rgb`; `times` as fine, of `rgb`."""
+        m, h, w, _ = self.coarse.shape
+        size = (times * h, times * w)
+        rgb = self.coarse
+        if times > 1:
+            rgb = jax.image.resize(self.rgb, (m, *size, 3), "linear", antialias=True)
+        sides = zip(size, self.rgb.shape[1:3], strict=True)
         factor = jnp.asarray([[small / large for small, large in sides]])
         moved = (factor * x for x in (self.size, self.scale, self.offset))
-        return Photos(self.coarse, self.coarse, *moved)
+        return Photos(rgb, self.coarse, *moved)
 
     def into(self, way: Motion) -> Motion:
         """`way`, in pixels of the model's photos, in pixels of these."""
@@ -43,7 +48,7 @@ class Photos(NamedTuple):
 class Blend(NamedTuple):
     """What a view takes from the photos, at the model's size."""
 
-    inverse: jax.Array  # [v, h, w] inverse depth
+    inverse: jax.Array  # [v, ., .] inverse depth, at the model's size or larger
     step: jax.Array  # [v] between the inverse depths that were compared
     share: jax.Array  # [v, m, h, w, 1] of each photo
     gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
@@ -123,7 +128,7 @@ def render(
 
 
 def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, height, width):
-    h, w = blend.inverse.shape
+    h, w = blend.head.shape[:2]
     where = pixels_of(height, width, (h / height, w / width))
     inverse = enlarged(blend.inverse, height, width, TOGETHER * blend.step).reshape(1, -1)
     met = meet_at(whole.into(way), where, inverse, (whole.size[:, 0], whole.size[:, 1]))

@@ -99,8 +99,20 @@ def meet_at(way: Motion, pixels: jax.Array, inverse: jax.Array, size: Size):
     return x, y, z, seen.astype(jnp.float32)
 
 
+class Texels(NamedTuple):
+    """Images of one size, as rows to read from: made once for many reads."""
+
+    rows: jax.Array  # see `texels`
+    size: tuple[int, int]  # (height, width)
+
+    @classmethod
+    def of(cls, images: jax.Array) -> "Texels":
+        _, h, w, _ = images.shape
+        return cls(texels(images), (h, w))
+
+
 def fetch(
-    images: jax.Array,
+    images: jax.Array | Texels,
     way: Motion,
     pixels: jax.Array,
     inverse: jax.Array,
@@ -110,10 +122,11 @@ def fetch(
 
     Bilinear, border repeated. `size`: of the photos, if the images are larger than them.
     """
-    m, h, w, _ = images.shape
-    x, y, seen = meet(way, pixels, inverse, (h, w) if size is None else size)
-    first = jnp.arange(m, dtype=jnp.int32) * ((h - 1) * (w - 1))
-    return bilinear(texels(images), x, y, (h, w), first[:, None, None]), seen
+    held = images if isinstance(images, Texels) else Texels.of(images)
+    h, w = held.size
+    x, y, seen = meet(way, pixels, inverse, held.size if size is None else size)
+    first = jnp.arange(len(x), dtype=jnp.int32) * ((h - 1) * (w - 1))
+    return bilinear(held.rows, x, y, (h, w), first[:, None, None]), seen
 
 
 def texels(images: jax.Array) -> jax.Array:

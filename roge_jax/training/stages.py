@@ -19,16 +19,18 @@ from ..core.lora import attach
 from ..core.params import Tree, loaded
 from ..data.views import ViewConfig, draw_batch
 from ..errors import UserError, did_you_mean
+from ..recon.depth import FINER
 from ..recon.picture import decode_all
 from ..video import dit, vae, vae_training
 from . import encoded
+from .matching import matching_terms
 from .optim import OptimConfig
 
 
 @dataclass(frozen=True)
 class Stage:
     name: str
-    objective: str  # vae | recon | prior | joint | encoded
+    objective: str  # vae | recon | match | prior | joint | encoded
     trains: str  # regular expression for parameter paths
     steps: int
     batch: int
@@ -81,6 +83,15 @@ def recon_objective(trainable, frozen, batch, key, *, config, stage):
     return loss, told | {"psnr_photos": -10 * jnp.log10(terms["photos"])}
 
 
+def match_objective(trainable, frozen, batch, key, *, config, stage):
+    """How well photos are matched along the rays of a target view of known depth (`training.matching`)."""
+    match = attach(frozen, trainable)["renderer"]["lookup"]["match"]
+    keys = jax.random.split(key, batch["K"].shape[0])
+    term = functools.partial(matching_terms, cuts=config.renderer.lookup)
+    terms = {k: v.mean() for k, v in model.over_scenes(term, match, batch, keys).items()}
+    return terms["loss"], {"right": terms["right"]}
+
+
 def prior_objective(trainable, frozen, batch, key, *, config, stage):
     """Flow matching without rays or geometry: photos to video, the generator that RoGe starts from."""
     params = attach(frozen, trainable)
@@ -123,12 +134,14 @@ LEVELS = 0.3  # weight of the look-up's levels beside its picture
 READS = {
     "vae": "^vae/",
     "recon": "^(encoder|renderer)/",
+    "match": "^renderer/lookup/match/",
     "encoded": "^(dit|fusion|prompt)/",
 }
 
 OBJECTIVES = {
     "vae": vae_objective,
     "recon": recon_objective,
+    "match": match_objective,
     "prior": prior_objective,
     "joint": joint_objective,
     "encoded": encoded_objective,
@@ -148,19 +161,26 @@ _FINE = dataclasses.replace(_SCRATCH, learning_rate=2e-4, warmup=10, betas=(0.9,
 _SMALL = dataclasses.replace(_SCRATCH, name="adamw", warmup=30, betas=(0.9, 0.98))
 
 RECON = "^(encoder|renderer/(?!lookup/))"  # all of the reconstruction but the look-up
+LOOKUP = (
+    "^renderer/lookup/(?!match/)"  # what has a stage of its own is told by depth, not by pictures
+)
+JOINT = "^(dit|fusion|encoder|renderer/(?!lookup/match/))"
 
 
-def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list[Stage]:
+def mini_stages(
+    scale: float = 1.0, *, frames: int = 17, size: tuple[int, int] = (64, 112)
+) -> list[Stage]:
     """The recipe of the shipped small model, in order; `scale` multiplies every number of steps.
 
-    `side`: pixels of the shorter side of a picture, which crops do not exceed.
+    `size`: of its pictures, whose shorter side crops do not exceed.
     """
-    crop = min(64, side)
+    crop, fine = min(64, *size), (FINER * size[0], FINER * size[1])
     video = ViewConfig(targets=frames, ordered=True)
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
     few = ViewConfig(targets=4, near=0.5, faults=0.3, context_weights=(0.05, 0.35, 0.4, 0.2))
+    pairs = ViewConfig(*((2, 3, 4), (0.4, 0.35, 0.25)), targets=1, near=0.5, size=fine, depth=True)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=crop),
@@ -168,7 +188,8 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list
         Stage("vae_longer", "vae", "^vae/", 1500, 1, _GENTLE, video, crop=crop),
         Stage("recon_low", "recon", RECON, 3000, 16, _SCRATCH, views, recon_shrink=2),
         Stage("recon", "recon", RECON, 3000, 8, _SCRATCH, ViewConfig(targets=6)),
-        Stage("lookup", "recon", "^renderer/lookup/", 3000, 3, _SMALL, few, lookup=True),
+        Stage("lookup", "recon", LOOKUP, 3000, 3, _SMALL, few, lookup=True),
+        Stage("match", "match", "^renderer/lookup/match/", 1500, 1, _SMALL, pairs),
         Stage("prior", "prior", "^dit/", 400, 4, _SCRATCH, video, draws=4),
         Stage(
             "generator",
@@ -185,7 +206,7 @@ def mini_stages(scale: float = 1.0, *, frames: int = 17, side: int = 64) -> list
         Stage(
             "vae_decoder", "vae", "^vae/(decoder|post_quant)/", 800, 1, _GENTLE, video, crop=crop
         ),
-        Stage("joint", "joint", "^(dit|fusion|encoder|renderer)/", 100, 1, _FINE, video, draws=6),
+        Stage("joint", "joint", JOINT, 100, 1, _FINE, video, draws=6),
     ]
     return [dataclasses.replace(s, steps=max(1, round(s.steps * scale))) for s in stages]
 

@@ -29,7 +29,7 @@ def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
     working = stage_config(config, stage)
     window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
     try:
-        return open_source(pool, working.height, working.width, window)
+        return open_source(pool, working.height, working.width, window, stage.views.depth)
     except UserError as error:
         raise UserError(f"Stage {stage.name}: {error}") from None
 

@@ -22,7 +22,7 @@ def test_mirrored_samples_are_views_of_the_mirrored_scene():
     picture[:, :, line] = 0.6
     seen = set()
     for seed in range(12):
-        rgb, K, c2w = alter(np.random.default_rng(seed), picture, cameras.K, cameras.c2w)
+        rgb, K, c2w, _ = alter(np.random.default_rng(seed), picture, cameras.K, cameras.c2w)
         row = np.abs(rgb - np.median(rgb, (1, 2), keepdims=True)).sum((0, 1, 3))
         mirrored = int(np.argmax(row)) == WIDTH - 1 - line
         assert mirrored or np.argmax(row) == line
@@ -45,7 +45,7 @@ def test_all_views_of_a_sample_are_recoloured_alike_and_stay_in_range():
     K, c2w = np.tile(np.eye(3), (3, 1, 1)), np.tile(np.eye(4), (3, 1, 1))
     inverted = 0
     for seed in range(40):
-        found, _, _ = alter(np.random.default_rng(seed), rgb, K, c2w)
+        found, *_ = alter(np.random.default_rng(seed), rgb, K, c2w)
         np.testing.assert_array_equal(found[0], found[2])
         assert found.min() >= 0.0 and found.max() <= 1.0 and not np.array_equal(found, rgb)
         grey, was = (np.sort(x[0].mean(-1).ravel()) for x in (found, rgb))
@@ -131,3 +131,41 @@ def test_samples_are_the_frames_drawn_in_the_frame_of_the_first_context():
         poses[:, :3, 3] /= np.linalg.norm(poses[:3, :3, 3], axis=-1).max()
         np.testing.assert_allclose(batch["c2w"][i], poses, atol=1e-5)
         np.testing.assert_allclose(batch["vectors"][i, :, :3], poses[:3, :3, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [None, (12, 10)])
+def test_depth_of_samples_is_that_of_their_pixels_in_their_unit(size):
+    """Wherever a picture is mirrored, shrunk or put into another unit, its depth is as well."""
+    cameras = looking_at_origin(FRAMES)
+    depth = np.tile(np.linspace(1.0, 3.0, WIDTH, dtype=np.float32), (FRAMES, HEIGHT, 1))
+    rgb = np.repeat(np.round(80 * depth)[..., None], 3, -1).astype(np.uint8)
+    pool = [{"rgb": rgb, "K": cameras.K, "c2w": cameras.c2w, "depth": depth}]
+    mirrored = set()
+    for augment, indices in ((False, range(1)), (True, range(8))):
+        cfg = ViewConfig((2,), (1.0,), targets=1, augment=augment, size=size, depth=True)
+        for index in indices:
+            batch = draw_batch(pool, 1, index, 1, cfg, scale_rule="paper")
+            found = batch["depth"][0]
+            assert found.shape == (3, *batch["target_rgb"].shape[2:4])
+            row, picture = found[2, 3], batch["target_rgb"][0, 0, 3].mean(-1)
+            rising = abs(np.corrcoef(row, picture)[0, 1])  # colours may be inverted
+            assert rising > 0.98
+            unit = np.sort(row)[[0, -1]]
+            assert unit[1] / unit[0] == pytest.approx(3.0, rel=0.15)
+            mirrored.add(bool(row[0] > row[-1]))
+    assert mirrored == {False, True}
+    bare = [{"rgb": rgb, "K": cameras.K, "c2w": cameras.c2w}]
+    with pytest.raises(UserError, match=r"no depth.*--depth"):
+        draw_batch(bare, 1, 0, 1, cfg, scale_rule="paper")
+
+
+def test_depth_of_a_sample_is_divided_by_what_its_positions_are():
+    cameras = looking_at_origin(FRAMES)
+    depth = np.full((FRAMES, HEIGHT, WIDTH), 5.0, np.float32)
+    rgb = np.zeros((FRAMES, HEIGHT, WIDTH, 3), np.uint8)
+    pool = [{"rgb": rgb, "K": cameras.K, "c2w": cameras.c2w, "depth": depth}]
+    cfg = ViewConfig((2,), (1.0,), targets=1, augment=False, depth=True)
+    batch = draw_batch(pool, 1, 0, 1, cfg, scale_rule="paper")
+    apart = np.linalg.norm(batch["c2w"][0, 1, :3, 3])
+    ratios = [np.linalg.norm(a[:3, 3] - b[:3, 3]) / apart for a in cameras.c2w for b in cameras.c2w]
+    assert np.min(np.abs(5.0 / batch["depth"][0, 0, 0, 0] - ratios)) < 1e-4

@@ -31,6 +31,7 @@ from roge_jax.procedural.textures import (
     PHOTO_NAMES,
     PHOTOS,
     TEXELS,
+    folder_pictures,
     load_textures,
 )
 
@@ -493,3 +494,48 @@ def test_damaged_shards_are_named(damage, tmp_path):
     changes[damage]()
     with pytest.raises(UserError, match=r"shard_00000: .*write the pool again"):
         read_pool(tmp_path)
+
+
+def pictures(folder, kinds: int):
+    """Two pictures of every kind, one of them small, of a colour of their own."""
+    from PIL import Image
+
+    (folder / "deeper").mkdir(parents=True)
+    for i in range(kinds):
+        for k, side in enumerate((40, 300)):
+            colour = (i * 255 // kinds, 90, 255 - i * 255 // kinds)
+            Image.new("RGB", (side, side), colour).save(folder / f"deeper/Kind{i}_{k:03d}.png")
+    return folder
+
+
+def test_textures_of_a_folder_keep_a_tenth_of_the_kinds_apart(tmp_path):
+    folder = pictures(tmp_path / "pictures", 20)
+    train, heldout = (folder_pictures(folder, split) for split in ("train", "heldout"))
+    kinds = [{p.stem.partition("_")[0] for p in part} for part in (train, heldout)]
+    assert len(kinds[1]) == 2 and not kinds[0] & kinds[1] and len(train) + len(heldout) == 40
+    plain, one, again, other = (
+        load_textures("train", *more) for more in ((), (folder, 1), (folder, 1), (folder, 2))
+    )
+    assert plain.shape == one.shape and not np.array_equal(plain, one)
+    np.testing.assert_array_equal(one, again)
+    assert not np.array_equal(one, other)
+    with pytest.raises(UserError, match="no picture for the train textures"):
+        folder_pictures(tmp_path / "nothing", "train")
+    with pytest.raises(UserError, match=r"heldout textures: .* of ten kinds"):
+        folder_pictures(pictures(tmp_path / "few", 3), "heldout")
+    (folder / "broken_1.png").write_bytes(b"no picture")
+    with pytest.raises(UserError, match=r"broken_1.png cannot be read as a picture .*: remove it"):
+        for draw in range(3, 30):
+            load_textures("train", folder, draw)
+
+
+def test_a_pool_with_textures_of_a_folder_differs_and_says_so(tmp_path):
+    folder = pictures(tmp_path / "pictures", 12)
+    size = {"frames": 2, "height": 16, "width": 24, "supersample": 1}
+    plain = sample_sequence(7, **size, varied=True)
+    write_pool(tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=folder)
+    made = read_pool(tmp_path / "pool")[0]
+    np.testing.assert_allclose(made["c2w"], plain["c2w"])
+    assert not np.array_equal(made["rgb"], plain["rgb"])
+    with pytest.raises(UserError, match="holds a pool with textures"):
+        write_pool(tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=tmp_path)

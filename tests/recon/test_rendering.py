@@ -64,21 +64,6 @@ def test_the_cut_between_cuts_is_a_parabola_s():
         assert float(aggregate.cheapest(jnp.asarray(cost))[0, 0]) == end
 
 
-def test_one_pair_that_agrees_is_enough_and_strangers_are_not():
-    """A photo with something in front does not raise the cost that the two others agree on."""
-    values = np.zeros((3, 4, 1, 4))
-    values[:, 1] = RNG.random((3, 1, 4))  # three strangers
-    values[2, 2] = 0.8  # two agree, one is occluded
-    seen = np.ones((3, 4, 1))
-    seen[1:, 3] = 0.0  # one alone
-    cost = np.asarray(aggregate.difference(*map(jnp.asarray, (values, seen)), jnp.eye(3)))[:, 0]
-    assert cost[0] < 1e-3 and cost[2] < 0.07 < cost[1]
-    assert cost[3] == pytest.approx(-0.5 * aggregate.DIFFERENCE * np.log(1e-4), rel=1e-4)
-    twins = jnp.ones((3, 3))  # from one place they are no witnesses of each other
-    alone = np.asarray(aggregate.difference(*map(jnp.asarray, (values, seen)), twins))[:, 0]
-    np.testing.assert_allclose(alone, cost[3], rtol=1e-4)
-
-
 def test_enlarged_cuts_never_lie_between_two_surfaces():
     cut = np.full((6, 8), 3.0)
     cut[:, 4:] = 11.0

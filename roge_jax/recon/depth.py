@@ -1,0 +1,85 @@
+"""Where the surfaces of a view lie, coarse to fine: photos compared at many cuts of its rays, aggregated over the view.
+
+Coarse at the model's size, over all depths that photos share. Fine at twice its sides, between the coarse answers around
+a pixel, which moves borders to where the photos have them. No depth is handed out: it says where a picture's colours are
+read (`recon.rendering`).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from ..core.params import Tree
+from .aggregate import box, cheapest, envelope, occupied, semi_global, with_belief
+from .matching import described, evidence
+from .rendering import Photos
+from .sweep import Motion, Texels, all_cuts, fetch, inverse_depth, pixels_of
+
+FINER = 2  # times the model's sides, the fine level
+LABELS = 16  # depths that the fine level compares
+BEYOND = 1.0  # cuts further than the coarse answers that the fine level looks
+WINDOW, FINE_WINDOW = 2, 1  # pixels about which the evidence of either level is averaged
+
+
+class Level(NamedTuple):
+    """Photos of one fineness, and what they are compared by."""
+
+    texels: Texels
+    photos: Photos
+
+    @classmethod
+    def of(cls, match: Tree | None, photos: Photos) -> "Level":
+        return cls(Texels.of(described(match, photos.rgb)), photos)
+
+
+class Surfaces(NamedTuple):
+    """Of one view."""
+
+    inverse: jax.Array  # [FINER h, FINER w] inverse depth
+    step: jax.Array  # [] of inverse depth: neighbours on one surface differ by less
+
+
+def surfaces(
+    match: Tree | None,
+    levels: tuple[Level, Level],
+    way: Motion,
+    belief: jax.Array,
+    reach: jax.Array,
+    alike: jax.Array,
+    size: tuple[int, int],
+) -> Surfaces:
+    """`Surfaces` of a view of `size`, the model's.
+
+    Args:
+      match: leaves of `recon.matching`.
+      levels: photos about as fine as the model's, and `FINER` times that.
+      way: motion from the view to the photos, in pixels of the model's size.
+      belief: [k, ch, cw] the network's logits over the cuts of cells.
+      reach: share of the axis that the cuts divide (`sweep.shared_reach`).
+      alike: [m, m] (`sweep.twins`).
+    """
+    h, w = size
+    cuts = len(belief)
+
+    def matched(
+        level: Level, inverse: jax.Array, h: int, w: int, window: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """Evidence [k, h, w] for inverse depths [k, h w], and how many photos see them."""
+        where = pixels_of(h, w, (size[0] / h, size[1] / w))
+        photos = level.photos
+        frames = (photos.size[:, 0], photos.size[:, 1])
+        values, seen = fetch(level.texels, photos.into(way), where, inverse, frames)
+        found = evidence(match, values, seen, alike).reshape(-1, h, w)
+        return box(found, window), seen.sum(0).reshape(-1, h, w)
+
+    every = all_cuts(cuts, h * w, reach)
+    cut = cheapest(semi_global(with_belief(*matched(levels[0], every, h, w, WINDOW), belief)))
+    near, far = (inverse_depth(cut + beyond, cuts, reach) for beyond in (BEYOND, -BEYOND))
+    low, high = envelope(far, near, FINER * h, FINER * w)
+    labels = jnp.linspace(0.0, 1.0, LABELS)[:, None, None]
+    inverse = (low[None] + (high - low)[None] * labels).reshape(LABELS, -1)
+    found = matched(levels[1], inverse, FINER * h, FINER * w, FINE_WINDOW)
+    label = cheapest(semi_global(with_belief(*found)))
+    steps = occupied(inverse_depth(cut, cuts, reach), cuts)
+    return Surfaces(low + (high - low) * label / (LABELS - 1), steps[1] - steps[0])
