@@ -20,9 +20,11 @@ DRAWN := experiments.quality.training_curves
 COMPARISONS := experiments.speed.dit experiments.speed.vae experiments.speed.real_size
 COMPILED := experiments.scaling.compiled
 # Pages that are made from the code, and their drawings.
-GENERATED := experiments.pages.options experiments.pages.messages experiments.pages.diagrams
+GENERATED := experiments.pages.options experiments.pages.messages experiments.pages.modules \
+	experiments.pages.diagrams experiments.pages.evaluations
+HERO := experiments.pages.hero
 FIRST := experiments.quality.optimise_schedules
-FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED),$(EXPERIMENTS)))
+FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED) $(HERO),$(EXPERIMENTS)))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help

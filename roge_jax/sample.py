@@ -92,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
     option("--long", long_help, "chain", type=one_of(LONG))
     tolerance_help = (
         "spend no more than this needs: expected RMS colour difference (0 to 1) to the full model's frames, e.g. 0.02; "
-        "chooses among the photos, steps and more (docs/results/planning.md)"
+        "chooses among the photos, steps and more (docs/howto/cost.md)"
     )
     option("--tolerance", tolerance_help, type=number(0, whole=False))
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)

@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--mesh",
         help="how to split the work, e.g. data=2,fsdp=2,seq=2: scenes, weights, tokens and views of a\n"
-        "scene (default: all devices on data); see docs/results/scaling.md, also for several machines",
+        "scene (default: all devices on data); see docs/howto/gpus.md, also for several machines",
     )
     p.add_argument(
         "--frozen-dtype",

@@ -68,18 +68,21 @@ class Message(NamedTuple):
 
 def messages() -> list[Message]:
     """All of the package, without those that only pass another's words on."""
-    found = []
+    found: list[Message] = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        tree, file = ast.parse(path.read_text()), path.relative_to(PACKAGE).as_posix()
-        constants = assignments(tree.body)
-        for scope in scopes(tree):
-            local, last = assignments(ast.walk(scope)), 0
-            for call in sorted(calls(scope), key=lambda call: call.lineno):
-                hidden = parameters(scope, call)
-                seen = {name: values for name, values in local.items() if name not in hidden}
-                found += sentences(call, constants, seen, last, file)
-                last = call.lineno
+        found += of_a_file(ast.parse(path.read_text()), path.relative_to(PACKAGE).as_posix())
     return sorted(set(found), key=lambda one: (one.file, one.cause.lower(), one.cure))
+
+
+def of_a_file(tree: ast.Module, file: str) -> Iterator[Message]:
+    constants = assignments(tree.body)
+    for scope in scopes(tree):
+        local, last = assignments(ast.walk(scope)), 0
+        for call in sorted(calls(scope), key=lambda call: call.lineno):
+            hidden = parameters(scope, call)
+            seen = {name: values for name, values in local.items() if name not in hidden}
+            yield from sentences(call, constants, seen, last, file)
+            last = call.lineno
 
 
 def scopes(tree: ast.AST) -> Iterator[ast.AST]:
@@ -162,7 +165,7 @@ def sentences(
     for what, fix in together:
         text = spelled(what, names)
         cause, cure = split(text) if fix is None else (text, spelled(fix, names))
-        if words(f"{cause} {cure}") > 1:
+        if words(f"{cause} {cure}"):
             yield Message(kind, cause, cure, file)
 
 
@@ -298,7 +301,7 @@ def room(file: str) -> str:
 
 def cell(text: str) -> str:
     text = re.sub(r"\s+", " ", text).strip()
-    return text.replace("|", r"\|").replace("<", "&lt;").replace("*", r"\*")
+    return text.replace("|", r"\|").replace("<", "&lt;").replace("*", r"\*").replace("] [", r"] \[")
 
 
 def page() -> str:

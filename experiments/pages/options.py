@@ -1,4 +1,5 @@
-"""Every option of every program, from the parsers themselves: docs/reference/programs.md.
+"""Every option of every program, from the parsers themselves: docs/reference/programs.md. And of every preset path:
+the table of docs/howto/paths.md.
 
         python -m experiments.pages.options
 
@@ -18,7 +19,7 @@ from unittest import mock
 import roge_jax
 from experiments import harness
 
-PAGE = harness.DOCS / "reference" / "programs.md"
+PAGE, PATHS = harness.DOCS / "reference" / "programs.md", harness.DOCS / "howto" / "paths.md"
 HEAD = """# Programs and their options
 
 Every program is a module: `python -m roge_jax.NAME`. Give `--help` for the same list on a terminal.
@@ -138,6 +139,32 @@ def page() -> str:
     )
 
 
+def presets() -> str:
+    """The table of preset paths: options with their defaults, and what the camera does."""
+    from roge_jax.geometry.trajectories import PRESETS
+
+    rows = []
+    for name, preset in PRESETS.items():
+        given = list(inspect.signature(preset).parameters.values())[2:]
+        shown = ", ".join(f"`{one.name}={_spelled(one.default)}`" for one in given)
+        rows.append(
+            (f"`{name}`", shown, inspect.getdoc(preset).replace("\n\n", " ").replace("\n", " "))
+        )  # type: ignore[union-attr]
+    return "\n".join(harness.table(["preset", "options", "the camera moves"], rows))
+
+
+def _spelled(value: object) -> str:
+    """As the command line has it; None is a choice that depends on the rest."""
+    return (
+        "true or false"
+        if value is None
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )
+
+
 if __name__ == "__main__":
+    harness.put(PATHS, "presets", presets())
     PAGE.write_text(page())
     print(PAGE.relative_to(harness.ROOT))

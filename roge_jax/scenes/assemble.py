@@ -70,7 +70,7 @@ def pose_frame(frame: Frame, source: str, *, exif: str = "auto", background: flo
         note(
             "note",
             "photos carry an EXIF orientation",
-            "see docs/explanation/conventions.md if they lie down",
+            "see docs/reference/formats.md if they lie down",
         )
     return Posed(K, c2w, size, photo, tuple(notes))
 

@@ -1,4 +1,4 @@
-"""Camera paths: any file or scene folder as the cameras of a video, and our own path files (docs/explanation/conventions.md)."""
+"""Camera paths: any file or scene folder as the cameras of a video, and our own path files (docs/reference/formats.md)."""
 
 import dataclasses
 import json
@@ -94,7 +94,7 @@ def load_path(
     """Cameras [n] (float64, OpenCV, world units) of a path file, or of a scene's own file or folder.
 
     Args:
-      file: our format, or any of those of `scenes.readers` (docs/explanation/conventions.md lists them).
+      file: our format, or any of those of `scenes.readers` (docs/reference/formats.md lists them).
       frames: how many frames to make of a file with key frames; others are taken as they are and must have this many.
       height: of the pictures to make; K is moved there from the file's own size by a centred crop and a resize.
         Default: K stays in pixels of the file's size.

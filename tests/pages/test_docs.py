@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments.pages import messages
 from experiments.pages import options as made_options
 from roge_jax import check, convert, evaluate, export, sample, train
 from roge_jax.files import entry
@@ -77,6 +76,32 @@ def test_options_exist(page):
     assert not faults, faults
 
 
+def blocks(text: str) -> list[tuple[str, list[str]]]:
+    """Commands of the programs in blocks of code, whole: (program, words)."""
+    fences = re.findall(r"^```(?:bash|text)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    indented = re.findall(r"^    (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M), re.M)
+    lines = [line for fence in fences for line in fence.splitlines()] + indented
+    found = []
+    for line in lines:
+        start = re.match(r"\s*(?:taskset -c \d+ )?python -m roge_jax\.([\w.]+)(.*)", line)
+        if start and not re.search(r"\[-|\.\.\.| \.\. |SCENE|NAME|MODEL", start[2]):
+            words = re.split(r"\s{2,}", start[2], maxsplit=1)[0]  # a remark may follow
+            found.append((start[1], shlex.split(words, comments=True)))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=called)
+def test_commands_are_understood(page):
+    """Options, their values and what must be given: every program takes the words as they are printed."""
+    programs = {made_options.name(module): module for module in made_options.programs()}
+    for name, words in blocks(page.read_text()):
+        entry.parse(made_options.parser(programs[name]), words)
+
+
+def test_many_commands_are_found():
+    assert sum(len(blocks(page.read_text())) for page in PAGES) > 40
+
+
 @pytest.mark.parametrize("page", PAGES, ids=called)
 def test_files_named_in_the_text_exist(page):
     pattern = r"(?:experiments|tests|notebooks|roge_jax)/[\w/]+\.(?:py|jsonl?|ipynb|md|png)"
@@ -110,11 +135,6 @@ def test_all_programs_are_found():
     """Those of the tests of this folder, and the two that make their parser on the way."""
     found = {made_options.name(module) for module in made_options.programs()}
     assert {*PARSERS, "data.pack", "procedural"} <= found
-
-
-@pytest.mark.parametrize("made", [made_options, messages], ids=lambda made: made.__name__)
-def test_pages_made_from_the_code_are_up_to_date(made):
-    assert made.PAGE.read_text() == made.page(), f"python -m {made.__name__}"
 
 
 def test_the_renderers_benchmark_prints_what_its_page_says(monkeypatch, capsys):
@@ -179,5 +199,9 @@ def test_the_checks_see_faults(tmp_path):
     page.write_text("# A title: one\n\n`python -m roge_jax.sample --nothing` and more --other\n")
     assert anchors(page) == {"a-title-one"}
     assert commands(page.read_text()) == [("sample", ["--nothing"])]
+    page.write_text(
+        "```bash\npython -m roge_jax.sample --seed 1 # x\n```\n\n    python -m roge_jax.check a   b\n"
+    )
+    assert blocks(page.read_text()) == [("sample", ["--seed", "1"]), ("check", ["a"])]
     with pytest.raises(Exception, match="nothing"):
         entry.parse(sample.parser(), ["--nothing"])
