@@ -79,10 +79,10 @@ figures: $(DEV)  ## every chart and table again; writes experiments/results (hou
 compare: $(PARITY)  ## speed beside PyTorch (installs torch and diffusers); writes experiments/results
 	@for f in $(COMPARISONS); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
 
-notebook: $(DEV)  ## run the notebook; the executed copy is outputs/from_rays_to_video.ipynb
-	@mkdir -p outputs
-	$(VENV)/bin/jupytext --to ipynb --execute --output outputs/from_rays_to_video.ipynb \
-		notebooks/from_rays_to_video.py
+notebook: $(DEV)  ## run the notebook and store its pictures in notebooks/from_rays_to_video.ipynb
+	$(VENV)/bin/jupytext --update --to ipynb notebooks/from_rays_to_video.py
+	$(RUN) -m nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
+		notebooks/from_rays_to_video.ipynb
 
 docs: $(DOCS)  ## the pages as a site (outputs/site/index.html), made from the code where they are made from it
 	@for page in $(GENERATED); do $(RUN) -m $$page || exit 1; done

@@ -15,10 +15,10 @@ ROOT = Path(__file__).resolve().parents[2]
 HOME, API, COPIES = "index.md", "reference/api", "files"
 ORDER = {
     "start": ["first_video", "own_photos", "published_weights"],
-    "howto": ["paths", "viewer", "pose", "training", "gpus", "cost", "library"],
-    "explanation": ["method", "conventions"],
-    "reference": ["programs", "messages", "formats", "samplers", "metrics", "weights", "glossary"],
-    "results": ["model_card"],
+    "howto": ["paths", "viewer", "pose", "size_and_length", "cost", "training", "gpus"],
+    "explanation": ["method", "conventions", "rendering", "long_paths", "planning"],
+    "reference": ["programs", "messages", "warnings", "formats", "samplers", "stages"],
+    "results": ["model_card", "speed", "solvers", "training", "robustness"],
 }
 LINK = re.compile(r"(\[(?:`(?P<name>[\w.]+)`)?[^\]]*\])\((?P<to>[^)\s]+)\)")
 FENCED = re.compile(r"(^```.*?^```$)", re.MULTILINE | re.DOTALL)
