@@ -8,6 +8,7 @@ RUN := $(VENV)/bin/python
 BASE := $(VENV)/.base
 DEV := $(VENV)/.dev
 PARITY := $(VENV)/.parity
+DOCS := $(VENV)/.docs
 # The compiler of GPUs has an environment of its own: beside it JAX would look for a GPU.
 AOT_VENV := .venv-aot
 AOT := $(AOT_VENV)/.aot
@@ -18,12 +19,16 @@ EXPERIMENTS := $(subst /,.,$(basename $(shell grep -l '^if __name__' experiments
 DRAWN := experiments.quality.training_curves
 COMPARISONS := experiments.speed.dit experiments.speed.vae experiments.speed.real_size
 COMPILED := experiments.scaling.compiled
+# Pages that are made from the code, and their drawings.
+GENERATED := experiments.pages.options experiments.pages.messages experiments.pages.modules \
+	experiments.pages.diagrams experiments.pages.evaluations
+HERO := experiments.pages.hero
 FIRST := experiments.quality.optimise_schedules
-FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED),$(EXPERIMENTS)))
+FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED) $(HERO),$(EXPERIMENTS)))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help
-.PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators check lint format figures compare notebook clean
+.PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators check lint format figures compare notebook docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -64,20 +69,24 @@ format: $(DEV)  ## let ruff order imports and lay out the code
 	$(VENV)/bin/ruff check --fix $(CODE)
 	$(VENV)/bin/ruff format $(CODE)
 
-figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/figures.md has single ones)
-	$(RUN) -m roge_jax.evaluate --size 64x112 --out experiments/results/mini_procedural.json --sheet docs/mini_procedural.png
+figures: $(DEV)  ## every chart and table again; writes experiments/results (hours; docs/development/figures.md has single ones)
+	$(RUN) -m roge_jax.evaluate --size 64x112 --out experiments/results/mini_procedural.json --sheet docs/media/mini_procedural.png
 	$(RUN) -m roge_jax.evaluate --sweep 100 130 --size 64x112 --out experiments/results/mini_wide.json
-	$(RUN) -m roge_jax.procedural sheet --out docs/procedural.png
+	$(RUN) -m roge_jax.procedural sheet --out docs/media/procedural.png
 	$(RUN) -m $(DRAWN) --draw
 	@for f in $(FIGURES); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
 
 compare: $(PARITY)  ## speed beside PyTorch (installs torch and diffusers); writes experiments/results
 	@for f in $(COMPARISONS); do echo "== $$f"; $(RUN) -m $$f || exit 1; done
 
-notebook: $(DEV)  ## run the notebook; the executed copy is outputs/from_rays_to_video.ipynb
-	@mkdir -p outputs
-	$(VENV)/bin/jupytext --to ipynb --execute --output outputs/from_rays_to_video.ipynb \
-		notebooks/from_rays_to_video.py
+notebook: $(DEV)  ## run the notebook and store its pictures in notebooks/from_rays_to_video.ipynb
+	$(VENV)/bin/jupytext --update --to ipynb notebooks/from_rays_to_video.py
+	$(RUN) -m nbconvert --to notebook --execute --inplace --ExecutePreprocessor.record_timing=False \
+		notebooks/from_rays_to_video.ipynb
+
+docs: $(DOCS)  ## the pages as a site (outputs/site/index.html), made from the code where they are made from it
+	@for page in $(GENERATED); do $(RUN) -m $$page || exit 1; done
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --strict $(ARGS)
 
 clean:  ## remove caches (not runs, outputs or the environment)
 	rm -rf .jax_cache .pytest_cache .ruff_cache .mypy_cache .hypothesis
@@ -99,6 +108,10 @@ $(AOT): pyproject.toml
 	@test -x $(AOT_VENV)/bin/python || $(PYTHON) -m venv $(AOT_VENV)
 	$(AOT_VENV)/bin/python -m pip install --quiet --editable '.[aot]' pytest pytest-xdist hypothesis beartype
 	@touch $@
+
+$(DOCS): pyproject.toml | $(VENV)/bin/python
+	$(RUN) -m pip install --quiet --editable '.[docs]'
+	@touch $@ $(BASE)
 
 $(PARITY): pyproject.toml | $(VENV)/bin/python
 	$(RUN) -m pip install --quiet --editable '.[dev,parity]'

@@ -8,5 +8,5 @@ scaling     memory, communication and work of models too large to run here
 ablation    which parts of the small model earn their keep
 results     what was measured: JSON, pictures
 
-`harness.py` is what they share. docs/figures.md has the commands.
+`harness.py` is what they share. docs/development/figures.md has the commands.
 """

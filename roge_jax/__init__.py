@@ -3,7 +3,7 @@
     import roge_jax as rj
     params, config = rj.load("mini")
 
-docs/library.md shows the rest. Modules are imported on first use, so that `import roge_jax` costs nothing.
+docs/howto/library.md shows the rest. Modules are imported on first use, so that `import roge_jax` costs nothing.
 """
 
 import importlib

@@ -297,7 +297,7 @@ def _mini() -> RoGeConfig:
         ),
         fusion=FusionConfig(geometry_channels=128, preview=True),
         # What the preview leaves open is small: it is decided at low noise levels, and those must not be rare.
-        # Few steps end between the preview and the exact solution, which is less close to the truth (docs/solvers.md).
+        # Few steps end between the preview and the exact solution, which is less close to the truth (docs/results/solvers.md).
         flow=FlowConfig(shift=1.0, weighting="uniform", steps=2, schedule="uniform"),
         lora=LoraConfig(dit_rank=8, recon_rank=8),
     )

@@ -5,7 +5,7 @@
     ... --dry-run                reads headers alone and prints what would fill what
 
 Every tensor of every file is used once and every leaf filled once, or all that does not fit is listed in one error.
-Memory stays at a few of the largest tensors. docs/weights.md says where the files come from and under which licence.
+Memory stays at a few of the largest tensors. docs/start/published_weights.md says where the files come from and under which licence.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Evaluate: `python -m roge_jax.evaluate --scenes procedural:1000000000..1000000049 DIR ... --out results.json`.
+"""Compare a model with the truth and with baselines: `python -m roge_jax.evaluate --scenes procedural:1000000000..1000000049 DIR ... --out results.json`.
 
 Per scene, `context` photos are spread over a run of up to frames + context consecutive views and the others are
 generated as one video. The model (`generated`, `rgb_head`) stands beside what needs no learning (`nearest`,

@@ -1,13 +1,13 @@
 """Make a video of a scene along a camera path: `python -m roge_jax.sample`, all options have defaults.
 
-    python -m roge_jax.sample                                      two real photos, an orbit, the shipped model
+    python -m roge_jax.sample                                      two real photos, a path between them, the shipped model
     python -m roge_jax.sample --scene DIR --trajectory spiral --frames 49 --seed 1
     python -m roge_jax.sample --scene DIR --context 0,7,12 --trajectory orbit:degrees=90,swing=false
     python -m roge_jax.sample --scene DIR --trajectory path.json
     python -m roge_jax.sample --checkpoint paper --context 6 --dry-run     shapes, FLOPs, memory; no weights needed
 
 OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., transforms.json (the frames with
-their cameras, in the scene's frame and unit), contact_sheet.png and run.json. docs/sampling.md explains everything.
+their cameras, in the scene's frame and unit), contact_sheet.png and run.json. docs/start/first_video.md explains everything.
 """
 
 import argparse
@@ -92,7 +92,7 @@ def parser() -> argparse.ArgumentParser:
     option("--long", long_help, "chain", type=one_of(LONG))
     tolerance_help = (
         "spend no more than this needs: expected RMS colour difference (0 to 1) to the full model's frames, e.g. 0.02; "
-        "chooses among the photos, steps and more (docs/planning.md)"
+        "chooses among the photos, steps and more (docs/howto/cost.md)"
     )
     option("--tolerance", tolerance_help, type=number(0, whole=False))
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)

@@ -1,4 +1,4 @@
-"""Train: `python -m roge_jax.train PRESET`, by default the paper's recipe on top of the shipped weights.
+"""Train a model: `python -m roge_jax.train PRESET`, by default the paper's recipe on top of the shipped weights.
 
     python -m roge_jax.train mini                          LoRA + new embeddings, end to end, from the shipped model
     python -m roge_jax.train mini --stage all --init scratch --out runs/mini     the recipe of the shipped model
@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
         help="HEIGHTxWIDTH (default: the model's own, for stage hires twice that); in 'all' that of the stages\n"
         "before hires, which doubles it",
     )
-    p.add_argument("--seed", type=number(0), default=0)
+    p.add_argument("--seed", type=number(0), default=0, help="of weights, data and noise")
     p.add_argument("--resume", action="store_true", help="continue from the last checkpoint in OUT")
     p.add_argument(
         "--devices", type=number(1), help="devices to use, on one machine (default: all)"
@@ -72,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--mesh",
         help="how to split the work, e.g. data=2,fsdp=2,seq=2: scenes, weights, tokens and views of a\n"
-        "scene (default: all devices on data); see docs/scaling.md, also for several machines",
+        "scene (default: all devices on data); see docs/howto/gpus.md, also for several machines",
     )
     p.add_argument(
         "--frozen-dtype",

@@ -1,7 +1,7 @@
 """Which parts of the small model earn their keep: every part removed or resized, at equal compute.
 
     OPENBLAS_NUM_THREADS=1 NPROC=1 XLA_FLAGS=--xla_cpu_multi_thread_eigen=false taskset -c 0 \\
-        python -m experiments.ablation --data runs/pool         # results/ablation.{json,png}, docs/ablation.md
+        python -m experiments.ablation --data runs/pool         # results/ablation.{json,png}, docs/results/ablation.md
 
 CPU, about two hours on one core that is idle otherwise. Finished rows are in the JSON and are not run again, unless their
 settings or the shipped weights that they measure have changed; several processes may share the work, each on its core
@@ -19,7 +19,7 @@ with its own `--only`. Without `--data` scenes are rendered as they are needed. 
                   with the update cut to lower ranks
   adaptation      the same on one scene, scored on frames kept back; and trained at lower ranks outright
 
-The published system reports no such ablation. Our numbers and what they are worth: docs/ablation.md.
+The published system reports no such ablation. Our numbers and what they are worth: docs/results/ablation.md.
 """
 
 import argparse
@@ -176,7 +176,7 @@ def main() -> None:
     rows = stored(path)
     report.draw(rows, args.out / "ablation.png")
     if args.out == harness.RESULTS:
-        harness.put(harness.DOCS / "ablation.md", "ablation", report.tables(rows))
+        harness.put(harness.DOCS / "results" / "ablation.md", "ablation", report.tables(rows))
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ Beside it stand controls that cost no more, never more:
            that either, the head at half size
 A control without a plan of that cost is null in the document and left out of the comparison, which counts such pairs.
 Errors are RMS colour differences, to the full model's frames (what the tolerance is about) and to the truth.
-The published system has no such chart. Our numbers: docs/planning.md.
+The published system has no such chart. Our numbers: docs/results/planning.md.
 """
 
 import dataclasses
@@ -275,7 +275,7 @@ def main() -> None:
     document["summary"] = report.summarise(document["rows"])
     harness.write("plan_ladder.json", document)
     report.draw(document, "plan_ladder.png")
-    page = harness.DOCS / "planning.md"
+    page = harness.DOCS / "results" / "planning.md"
     harness.put(page, "plan_ladder", report.table(document["summary"]))
     print(f"wrote plan_ladder.json, its picture and the table of {page}")
     print(report.words(document["summary"]))

@@ -4,7 +4,7 @@
     python -m experiments.quality.mini --scenes 2 --solvers euler ab2 --budgets 4 8 --reference 16    # a quick look
 
 Writes results/mini_quality.json, mini_quality.png (samplers), mini_knobs.png (photos, size, precision, caches, peers) and the
-tables between the markers in docs/solvers.md. All points of a run share scenes (held-out split), photos and noise.
+tables between the markers in docs/results/solvers.md. All points of a run share scenes (held-out split), photos and noise.
 Reference: classical Runge-Kutta, 64 graded steps; its self-error is the distance to 32 steps. Budgets are evaluations of
 the velocity network; a method takes as many steps as fit. Times: wall time of sampling alone, all scenes in one
 batch, divided by their number; median, fastest and slowest of three runs after one that is not counted, for every
@@ -13,7 +13,7 @@ method alike. Intervals: bootstrap over scenes, 95 %.
 PSNR to the truth alone cannot judge a sampler: the mean of all plausible videos, which one evaluation gives, is
 blurred and has the *higher* PSNR. Goals are therefore two-sided and include sharpness (`reaches`), and stand beside
 the distance to the reference's own frames. Schedules: run optimise_schedules.py first after any training.
-The published system reports no such chart. Our numbers: docs/solvers.md. Time on 4 CPU cores: in the JSON.
+The published system reports no such chart. Our numbers: docs/results/solvers.md. Time on 4 CPU cores: in the JSON.
 """
 
 import argparse
@@ -223,7 +223,7 @@ def finish() -> None:
     report = harness.read("mini_quality.json")
     charts.samplers(report, "mini_quality.png")
     charts.knobs(report, "mini_knobs.png")
-    harness.put(harness.DOCS / "solvers.md", "mini_quality", charts.tables(report))
+    harness.put(harness.DOCS / "results" / "solvers.md", "mini_quality", charts.tables(report))
     if not report["settings"]["schedules_are_of_these_weights"]:
         print(
             "The optimised schedules were found on other weights: run optimise_schedules.py first."

@@ -14,7 +14,7 @@ CPU, half a minute on four idle cores. Seed 0 throughout. Panels (n = what is av
   control  what the adaptive method spends: smooth, switch not named, switch named, tiny detail, NaN
 
 The JSON also holds errors by schedule (uniform, shift 5, graded) on an 8-D mixture.
-The published system reports no such map. Our numbers and the remedies: docs/solvers.md.
+The published system reports no such map. Our numbers and the remedies: docs/results/solvers.md.
 """
 
 import itertools

@@ -6,7 +6,7 @@
 
 Folders in the order of training, each with the log.jsonl of one stage; panels are the stages, by the folders' names.
 Rows are means over a fiftieth of a run. Results: experiments/results/training_curves.{json,png}; the shipped model's
-are described in docs/model_card.md.
+are described in docs/notes/making_mini.md.
 """
 
 import json

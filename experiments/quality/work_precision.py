@@ -15,7 +15,7 @@ Errors: relative L2 per sample to the truth in float64; median, quartiles and wo
 samples (seeds 0, 1, 2; the stiff problem has one start). Time: wall time of all samples of a seed, median and quartiles
 of 15 runs after the first; compilation apart (both in the JSON). A run with a non-finite or > 100 % error is a failure, drawn on
 the strip on top. Evaluations count velocity calls; with guidance each is two network calls inside the interval.
-The published system reports no such chart. Our numbers: docs/solvers.md.
+The published system reports no such chart. Our numbers: docs/results/solvers.md.
 """
 
 import time

@@ -8,7 +8,7 @@ A case is "program,device,data,fsdp,seq". Steps are those of `training.compiled`
 recomputation, a scene on every group of `seq` GPUs), `transformer step` that of `hires` on samples encoded once.
 `prepare`, `velocity` and `decode` are those of a window with 6 photos. bfloat16 matrices, M = 6, preset `paper`. Every
 case compiles in a process of its own. Nothing here is a time on a GPU. Writes experiments/results/compiled.json and
-the table in docs/scaling.md.
+the table in docs/results/scaling.md.
 """
 
 import argparse
@@ -169,7 +169,7 @@ def main() -> None:
         today = datetime.date.today().isoformat()
         harness.write("compiled.json", {"date": today, "versions": plugin, "rows": rows})
     lines = table(rows)
-    harness.put(harness.DOCS / "scaling.md", "compiled", "\n".join(lines))
+    harness.put(harness.DOCS / "results" / "scaling.md", "compiled", "\n".join(lines))
     print("\n".join(lines))
 
 

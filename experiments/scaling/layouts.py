@@ -3,7 +3,7 @@
     python -m experiments.scaling.layouts          minutes, any machine: nothing is allocated or measured
 
 Memory and work are those of `roge_jax.training.estimate` (the step traced on abstract arrays), volumes are arithmetic on
-specs and the sharding table; assumptions stand in `docs/scaling.md`, whose tables this program rewrites. The paper trains on 192 H20 GPUs at batch 1 each and
+specs and the sharding table; assumptions stand in `docs/results/scaling.md`, whose tables this program rewrites. The paper trains on 192 H20 GPUs at batch 1 each and
 states neither memory nor time per step. Writes experiments/results/scaling.json.
 """
 
@@ -188,7 +188,7 @@ def main() -> None:
     results["growth"], table = growth()
     lines += ["**Growth of one scene** (one GPU)", "", *table]
     harness.write("scaling.json", results)
-    harness.put(harness.DOCS / "scaling.md", "scaling", "\n".join(lines))
+    harness.put(harness.DOCS / "results" / "scaling.md", "scaling", "\n".join(lines))
     print("\n".join(lines))
 
 

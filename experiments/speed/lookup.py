@@ -5,7 +5,7 @@
 
 `mini`'s look-up for the 20 views of a window with 3 photos: the picture, its gradient by the ray features (what LoRA
 training needs) and by the look-up's weights (stage `lookup`). Processor seconds, the formulations in turn within every
-repeat; temporary memory by XLA's own account. Described in docs/training.md.
+repeat; temporary memory by XLA's own account. Described in docs/notes/making_mini.md.
 """
 
 import jax

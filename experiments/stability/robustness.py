@@ -16,7 +16,7 @@ levels, with a bootstrap interval; a second break is where it falls below `neare
 With --limits the earlier 1 dB break of the two outputs, in units of what can be seen at run time (`roge_jax.sampling.limits`),
 becomes the limit of the warning; where a limit is an estimate from the photos and more than 5 % of 200 undisturbed
 scenes lie beyond it, it moves outwards to their 95 % quantile. What wrong poses and focal lengths show in matched photos
-is measured without the network (`matching.py`). `--only` measures some of it again and keeps the rest. The published system reports no such curves. Our numbers: docs/robustness.md.
+is measured without the network (`matching.py`). `--only` measures some of it again and keeps the rest. The published system reports no such curves. Our numbers: docs/results/robustness.md.
 """
 
 import functools

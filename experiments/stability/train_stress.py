@@ -7,7 +7,7 @@ the VAE trains) and LoRA, AdamW 1e-3, clip 1, 2 scenes of 2 photos and 5 targets
 training scenes rendered at 32x48. The loop is the package's own with its limits as they are (10 bad steps in a row, 1 %
 after step 100), but for a patience of 30 steps instead of 200. A run *survives* if it takes all steps and its median flow
 loss over the last 30 steps is within 10 % of its undisturbed run's; it *stops* if the loop ends it, with the reason;
-what does neither is *harmed*. The published system reports nothing of the kind. Our numbers: docs/training.md.
+what does neither is *harmed*. The published system reports nothing of the kind. Our numbers: docs/results/training.md.
 """
 
 import dataclasses

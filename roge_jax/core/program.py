@@ -6,7 +6,7 @@
 
 `peak` walks the operations in order and keeps book of buffers the way XLA does: cheap operations are fused into what
 reads them and have no buffer of their own; matrix products, loops and whatever those read have one, from where it is
-made to its last reader; a loop uses the same buffers every turn. `docs/scaling.md` says how close that comes to XLA.
+made to its last reader; a loop uses the same buffers every turn. `docs/results/scaling.md` says how close that comes to XLA.
 """
 
 import math

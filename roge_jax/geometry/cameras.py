@@ -1,6 +1,6 @@
 """Cameras: the struct, conventions, the world frame and scale that the networks expect.
 
-Conventions (docs/cameras.md): `c2w` is camera-to-world with OpenCV axes (x right, y down, z
+Conventions (docs/explanation/conventions.md): `c2w` is camera-to-world with OpenCV axes (x right, y down, z
 forward), `K` is in pixels of its own image, pixel edges lie at 0..W and pixel centres at +0.5.
 Everything here is float64 NumPy until a scene has been re-centred by `normalise`: in float32 a
 scene at UTM coordinates loses its rays altogether.
@@ -291,7 +291,8 @@ def normalise(
     """First context = world frame; one divisor brings positions to the scale the networks know.
 
     Args:
-      context, target: cameras in the scene's frame and unit, [m] and [n] views.
+      context: cameras of the photos [m] in the scene's frame and unit.
+      target: cameras of the path [n], likewise.
       rule: "lagernvs" divides by 1.35 * the largest distance of a context from the first (what the
         LagerNVS weights were trained on), "paper" by 1.0 * that distance.
       scale: a divisor chosen by the user, in scene units; overrides the rule.
@@ -385,8 +386,12 @@ def validate(
 ) -> Cameras:
     """The cameras in float64 if they can be used; slight skew is mended with a CameraWarning.
 
-    Args: K in pixels of images of `height` x `width` (one number, or one per view); `names` for
-      messages; `read_as` the convention that the poses were read in, if the user may choose another.
+    Args:
+      cameras: K in pixels of images of `height` x `width`.
+      height: of the images, one number or one per view.
+      width: likewise.
+      names: of the views, for messages.
+      read_as: the convention that the poses were read in, if the user may choose another.
     Raises: UserError naming the view and the field: NaN, mirrored, scaled or sheared rotation,
       wrong last row, focal length that is no focal length in pixels, principal point outside the
       picture.

@@ -99,7 +99,7 @@ def ray_distance(a: Any, b: Any, parallel_degrees: float = 1e-3) -> Any:
 
 
 def triangulate(a: Any, b: Any, min_degrees: float = 1.0) -> tuple[Any, Any]:
-    """The points [..., 3] midway between rays [d, m] [..., 6], and where they are `finite`.
+    """The points [..., 3] midway between rays [..., 6], which are [d, m], and where they are `finite`.
 
     `finite` is False where the rays meet at less than `min_degrees`: the point is at infinity and 0
     is returned.

@@ -1,4 +1,4 @@
-"""What is measured and what it is compared with. docs/metrics.md defines every number."""
+"""What is measured and what it is compared with. docs/reference/metrics.md defines every number."""
 
 from ..core.lazy import submodules
 

@@ -3,7 +3,7 @@
 Inputs everywhere: `context_rgb` [m, h, w, 3] in [0, 1], `context_K` [m, 3, 3], `context_c2w`
 [m, 4, 4], one target camera `K` [3, 3], `c2w` [4, 4] and the target's `size` (h, w). K in pixels
 with centres at +0.5, c2w with OpenCV axes, depth = z in the target camera in the unit of c2w.
-No function sees the target's pixels. docs/metrics.md says how strong each baseline is and why.
+No function sees the target's pixels. docs/reference/metrics.md says how strong each baseline is and why.
 """
 
 from typing import NamedTuple

@@ -2,7 +2,7 @@
 
 Poses are camera-to-world [n, 4, 4]; any camera axes will do as long as both paths use the same.
 All float64 NumPy. Conventions follow the trajectory-evaluation literature (Umeyama 1991 for the
-alignment; Sturm et al. 2012 for APE and RPE) and are spelled out in docs/metrics.md.
+alignment; Sturm et al. 2012 for APE and RPE) and are spelled out in docs/reference/metrics.md.
 """
 
 from typing import Any, NamedTuple

@@ -1,4 +1,4 @@
-"""No more model than a scene needs: what a run may leave out for a tolerance. docs/planning.md explains it."""
+"""No more model than a scene needs: what a run may leave out for a tolerance. docs/explanation/planning.md explains it."""
 
 from ..core.lazy import submodules
 

@@ -2,7 +2,7 @@
 
 All stretches of a plan have one length, since every length is a program to compile. They begin where a latent slot of
 the window ends: their slots then hold the window's own frames and noise. Anywhere else a stretch is another sample, as
-far from the full model's frames as the RGB head's picture is (docs/planning.md).
+far from the full model's frames as the RGB head's picture is (docs/results/planning.md).
 """
 
 from collections.abc import Iterator

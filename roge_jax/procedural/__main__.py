@@ -1,7 +1,7 @@
 """Rendered scenes from the command line.
 
 python -m roge_jax.procedural pool --out DIR --scenes 2000 --processes 4
-python -m roge_jax.procedural sheet --out docs/procedural.png
+python -m roge_jax.procedural sheet --out docs/media/procedural.png
 python -m roge_jax.procedural bench
 """
 
@@ -73,12 +73,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """`python -m roge_jax.procedural {pool,sheet,bench}`."""
     parser = argparse.ArgumentParser(prog="python -m roge_jax.procedural")
     commands = parser.add_subparsers(dest="command", required=True)
+    seeds = "seed of the first scene; from 1000000000 on they are held out"
     pool = commands.add_parser("pool", help="render many sequences into a folder")
-    pool.add_argument("--out", type=Path, required=True)
-    pool.add_argument("--scenes", type=number(1, 10**7), default=2000)
-    pool.add_argument("--first-seed", type=number(), default=0)
-    pool.add_argument("--processes", type=number(1), default=os.cpu_count() or 1)
-    pool.add_argument("--scenes-per-shard", type=number(1), default=100)
+    pool.add_argument("--out", type=Path, required=True, help="folder to write")
+    pool.add_argument("--scenes", type=number(1, 10**7), default=2000, help="how many")
+    pool.add_argument("--first-seed", type=number(), default=0, help=seeds)
+    cores = os.cpu_count() or 1
+    at_once = "how many render at a time (default: all cores)"
+    pool.add_argument("--processes", type=number(1), default=cores, help=at_once)
+    pool.add_argument("--scenes-per-shard", type=number(1), default=100, help="scenes in one file")
     pool.add_argument(
         "--textures",
         type=Path,
@@ -92,9 +95,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="many orbits and lenses (default: for training seeds, not for held-out ones)",
     )
     sheet = commands.add_parser("sheet", help="draw a contact sheet")
-    sheet.add_argument("--out", type=Path, required=True)
-    sheet.add_argument("--scenes", type=number(1, 10**7), default=8)
-    sheet.add_argument("--first-seed", type=number(), default=0)
+    sheet.add_argument("--out", type=Path, required=True, help="picture to write (PNG)")
+    sheet.add_argument("--scenes", type=number(1, 10**7), default=8, help="how many")
+    sheet.add_argument("--first-seed", type=number(), default=0, help=seeds)
     sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
     for command in (pool, sheet):
         command.add_argument(
@@ -102,11 +105,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
     for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
-        command.add_argument("--frames", type=number(1), default=frames)
-        command.add_argument("--height", type=number(1), default=64)
-        command.add_argument("--width", type=number(1), default=112)
+        command.add_argument("--frames", type=number(1), default=frames, help="views of a scene")
+        command.add_argument("--height", type=number(1), default=64, help="of the views")
+        command.add_argument("--width", type=number(1), default=112, help="of the views")
     for command in (pool, bench):
-        command.add_argument("--supersample", type=number(1), default=2)
+        rays = "rays per pixel and side"
+        command.add_argument("--supersample", type=number(1), default=2, help=rays)
     for command in (pool, sheet, bench):
         command.add_argument("--debug", action="store_true", help="show tracebacks")
     return execute(_run, parser, arguments)

@@ -5,7 +5,7 @@ how much wider or narrower they see, how many photos differ at all, how unlike t
 noisy they are. The limits are not chosen: `experiments/stability/robustness.py` disturbs held-out scenes, finds by interpolation
 where the model's output has lost 1 dB, and writes `assets/limits.json` with what produced it. What a photo shows moves
 the last three as well, so their limits lie no further in than where 95 % of the undisturbed scenes are. Models without
-an entry (by the name of their configuration) get no warnings. docs/robustness.md shows the curves.
+an entry (by the name of their configuration) get no warnings. docs/results/robustness.md shows the curves.
 """
 
 import functools
@@ -160,7 +160,8 @@ def beyond(
 
     Args:
       images: photos [m, h, w, 3] in [0, 1].
-      context, target: cameras [m], [n] in one frame, K in pixels of one size.
+      context: cameras of the photos [m], K in pixels of one size.
+      target: cameras of the path [n] in the same frame and pixels.
       ids: the photos' numbers for the messages; default 0 .. m - 1.
     """
     ids = list(range(len(context))) if ids is None else list(ids)

@@ -7,7 +7,7 @@ Here the chosen photos are matched with others of the scene (`scenes.matching.ph
 how many pixels of the model's picture features lie from where the poses put them, and whether other focal lengths would
 fit better. Of JPEG files the quality is read. What cannot be matched says nothing. `python -m roge_jax.sample` does this
 in a thread (`Beside`) while it compiles, and refuses poses of a `transforms.json` that are plainly in other axes than they
-are read in. docs/robustness.md says how the limits were measured.
+are read in. docs/notes/robustness.md says how the limits were measured.
 """
 
 import sys

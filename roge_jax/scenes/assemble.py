@@ -67,7 +67,11 @@ def pose_frame(frame: Frame, source: str, *, exif: str = "auto", background: flo
     if header.alpha:
         note("warning", "photos are transparent", f"they show background {background:g} there")
     if header.orientation != 1:
-        note("note", "photos carry an EXIF orientation", "see docs/cameras.md if they lie down")
+        note(
+            "note",
+            "photos carry an EXIF orientation",
+            "see docs/reference/formats.md if they lie down",
+        )
     return Posed(K, c2w, size, photo, tuple(notes))
 
 

@@ -33,8 +33,12 @@ def camera(
 ) -> tuple[np.ndarray | None, Size | None, Lens | None]:
     """(K [3, 3], the size (height, width) that it is for, lens) of an entry; K None if neither says anything.
 
-    Args: `picture` tells the size of the entry's photo, where the fields need one and do not say it; `target` is the
-      size of the pictures to make, which an angle alone is for.
+    Args:
+      entry: the fields of one camera.
+      defaults: the fields of the whole file; those of the entry win.
+      where: what messages call the entry.
+      picture: tells the size of the entry's photo, where the fields need one and do not say it.
+      target: the size of the pictures to make, which an angle alone is for.
     Raises: UserError naming `where` and the field.
     """
     sources = [{k: v for k, v in s.items() if v is not None} for s in (entry, defaults)]

@@ -1,4 +1,4 @@
-"""Camera paths: any file or scene folder as the cameras of a video, and our own path files (docs/cameras.md)."""
+"""Camera paths: any file or scene folder as the cameras of a video, and our own path files (docs/reference/formats.md)."""
 
 import dataclasses
 import json
@@ -94,10 +94,11 @@ def load_path(
     """Cameras [n] (float64, OpenCV, world units) of a path file, or of a scene's own file or folder.
 
     Args:
-      file: our format, or any of those of `scenes.readers` (docs/cameras.md lists them).
+      file: our format, or any of those of `scenes.readers` (docs/reference/formats.md lists them).
       frames: how many frames to make of a file with key frames; others are taken as they are and must have this many.
-      height, width: the pictures to make; K is moved there from the file's own size by a centred crop and a resize.
+      height: of the pictures to make; K is moved there from the file's own size by a centred crop and a resize.
         Default: K stays in pixels of the file's size.
+      width: likewise.
       context: whose first K (in pixels of height x width) is used if the file has no intrinsics, and whose first pose
         leads a path that is relative to its first camera.
       convention: axes of the poses where the format leaves them open and the file does not say them.

@@ -30,9 +30,7 @@ LAYOUTS = (
     "a RealEstate10K .txt with a folder of frames",
 )
 INNER = ("nerfstudio", "gaussian_splat", "exported", "dslr", "colmap", "dense")
-POSE_THEM = (
-    "photos without poses: docs/own_photos.md says how to pose them (COLMAP, or ns-process-data)"
-)
+POSE_THEM = "photos without poses: docs/start/own_photos.md says how to pose them (COLMAP, or ns-process-data)"
 
 
 def read_frames(path: Path, *, convention: str | None = None, camera: int = 0) -> list[Frame]:
@@ -274,7 +272,7 @@ def _what_folder(folder: Path) -> str:
         where = folder if here else below[0].parent
         return f"no known layout in this folder, {count} {POSE_THEM}; {where} has no poses beside it. {needs[:1].upper()}{needs[1:]}."
     if videos := [f for f in visible(folder, "*") if f.suffix.lower() in VIDEOS]:
-        return f"no known layout in this folder, but a video ({videos[0].name}): take photos out of it, then pose them (docs/own_photos.md); {needs}."
+        return f"no known layout in this folder, but a video ({videos[0].name}): take photos out of it, then pose them (docs/start/own_photos.md); {needs}."
     return f"no known layout in this folder: {needs}."
 
 

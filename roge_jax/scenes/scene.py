@@ -106,7 +106,10 @@ def open_scene(
         the stored grid), "ignore" takes the stored grid.
       background: what transparent pixels show, 1 is white.
       camera: which of Virtual KITTI 2's two cameras.
-      frames, height, width, supersample: of procedural scenes.
+      frames: of procedural scenes, as are the next three.
+      height: of the rendered views.
+      width: likewise.
+      supersample: rays per pixel and side.
     """
     name = str(spec)
     if name == "motorcycle":

@@ -39,8 +39,13 @@ def to_scene(
 ) -> np.ndarray:
     """Poses [n, 4, 4] of a path in the scene's coordinates.
 
-    Args: `frame` as the user says it (`load_path`); `kind` whose coordinates the path's format is in (`Reading.frame`);
-      `path` its file; `scene` the folder or file of the scene; `first` the c2w of the photo that leads.
+    Args:
+      c2w: the poses as they are written.
+      frame: as the user says it (`load_path`).
+      kind: whose coordinates the path's format is in (`Reading.frame`).
+      path: its file.
+      scene: the folder or file of the scene.
+      first: the c2w of the photo that leads.
     Raises: UserError where nobody says how the two belong together.
     """
     if frame is None and kind == "scene":

@@ -1,7 +1,7 @@
 """What a training step costs before it runs: work and memory of every device, from specs and sizes alone.
 
 The step is traced on abstract arrays (`core.program`); no weight is made or read. Exact for weights, optimiser and
-FLOPs; memory of activations comes from the order and fusion rules described there. `docs/scaling.md` compares it with
+FLOPs; memory of activations comes from the order and fusion rules described there. `docs/results/scaling.md` compares it with
 XLA's own analysis.
 """
 
@@ -291,7 +291,7 @@ def _share(x: Any, where: jax.sharding.NamedSharding) -> float:
 
 # ---- how much to recompute -----------------------------------------------------------------------
 
-LARGE = 1e9  # transformer parameters from which a step recomputes its blocks: see docs/scaling.md
+LARGE = 1e9  # transformer parameters from which a step recomputes its blocks: see docs/results/scaling.md
 
 
 def default_remat(config: RoGeConfig) -> str:

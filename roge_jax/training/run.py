@@ -23,7 +23,7 @@ from .stages import Stage
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What all stages of a run have in common; the names are those of the command line (docs/training.md)."""
+    """What all stages of a run have in common; the names are those of the command line (docs/reference/programs.md)."""
 
     out: Path
     data: Path | None = None  # a pool, or rendered as we go

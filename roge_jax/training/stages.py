@@ -153,7 +153,7 @@ _SCRATCH = OptimConfig(
 
 _GENTLE = dataclasses.replace(_SCRATCH, learning_rate=1e-3)
 
-# One scene a step on a trained model: steps of twice the rate undo more than they learn (docs/training.md).
+# One scene a step on a trained model: steps of twice the rate undo more than they learn (docs/notes/making_mini.md).
 _FINE = dataclasses.replace(_SCRATCH, learning_rate=2e-4, warmup=10, betas=(0.9, 0.98), ema=0.99)
 
 

@@ -1,4 +1,4 @@
-"""Published weights: the only place that knows the names of other code. docs/weights.md explains it."""
+"""Published weights: the only place that knows the names of other code. docs/reference/weights.md explains it."""
 
 from ..core.lazy import submodules
 

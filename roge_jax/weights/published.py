@@ -137,7 +137,7 @@ def fill_dit(cfg: DiTConfig, source: Source, framecrafter: Source | None = None)
     return [Filled("--wan", source, naming, fills, faults, notes), *merged]
 
 
-_RAYS_NOTE = "E1 from its first 36 input channels, fusion/rays_embed from the other 384 (see docs/weights.md)"
+_RAYS_NOTE = "E1 from its first 36 input channels, fusion/rays_embed from the other 384 (see docs/reference/weights.md)"
 
 
 def widened(fills: list[Fill], channels: int, wanted: int) -> tuple[list[Fill], list[Fill]]:

@@ -72,7 +72,7 @@ def test_only_what_lies_between_the_marks_is_replaced(tmp_path):
 )  # fmt: skip
 def test_the_pages_have_the_marks(page, name, tmp_path):
     copy = tmp_path / "page.md"
-    copy.write_text((harness.DOCS / f"{page}.md").read_text())
+    copy.write_text((harness.DOCS / "results" / f"{page}.md").read_text())
     harness.put(copy, name, "all new")
     assert "all new" in copy.read_text()
 

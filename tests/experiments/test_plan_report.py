@@ -338,7 +338,7 @@ def test_errors_are_realised_as_large_as_predicted(stored):
 
 def test_the_page_has_the_table_of_the_stored_rows(stored):
     table = report.table(report.summarise(stored["rows"]))
-    assert table in (harness.DOCS / "planning.md").read_text()
+    assert table in (harness.DOCS / "results" / "planning.md").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -10,14 +10,15 @@ from types import SimpleNamespace
 
 import pytest
 
+from experiments.pages import options as made_options
 from roge_jax import check, convert, evaluate, export, sample, train
-from roge_jax.data import pack
 from roge_jax.files import entry
 from roge_jax.procedural import __main__ as procedural_program
 from roge_jax.procedural import scenes as procedural
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FIGURES = ROOT / "docs" / "development" / "figures.md"
 PARSERS = {
     "check": check,
     "sample": sample,
@@ -26,6 +27,10 @@ PARSERS = {
     "convert": convert,
     "export": export,
 }
+
+
+def called(page: Path) -> str:
+    return page.relative_to(ROOT).with_suffix("").as_posix()
 
 
 def anchors(page: Path) -> set[str]:
@@ -41,7 +46,7 @@ def commands(text: str) -> list[tuple[str, list[str]]]:
     return [(name, shlex.split(re.split(r"\s{3,}", rest, maxsplit=1)[0])) for name, rest in found]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=called)
 def test_links_lead_somewhere(page):
     faults = []
     for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
@@ -56,7 +61,7 @@ def test_links_lead_somewhere(page):
     assert not faults, faults
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", PAGES, ids=called)
 def test_options_exist(page):
     known = {
         name: {word for action in module.parser()._actions for word in action.option_strings}
@@ -71,22 +76,38 @@ def test_options_exist(page):
     assert not faults, faults
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def blocks(text: str) -> list[tuple[str, list[str]]]:
+    """Commands of the programs in blocks of code, whole: (program, words)."""
+    fences = re.findall(r"^```(?:bash|text)?\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    indented = re.findall(r"^    (.*)$", re.sub(r"^```.*?^```", "", text, flags=re.S | re.M), re.M)
+    lines = [line for fence in fences for line in fence.splitlines()] + indented
+    found = []
+    for line in lines:
+        start = re.match(r"\s*(?:taskset -c \d+ )?python -m roge_jax\.([\w.]+)(.*)", line)
+        if start and not re.search(r"\[-|\.\.\.| \.\. |SCENE|NAME|MODEL", start[2]):
+            words = re.split(r"\s{2,}", start[2], maxsplit=1)[0]  # a remark may follow
+            found.append((start[1], shlex.split(words, comments=True)))
+    return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=called)
+def test_commands_are_understood(page):
+    """Options, their values and what must be given: every program takes the words as they are printed."""
+    programs = {made_options.name(module): module for module in made_options.programs()}
+    for name, words in blocks(page.read_text()):
+        entry.parse(made_options.parser(programs[name]), words)
+
+
+def test_many_commands_are_found():
+    assert sum(len(blocks(page.read_text())) for page in PAGES) > 40
+
+
+@pytest.mark.parametrize("page", PAGES, ids=called)
 def test_files_named_in_the_text_exist(page):
     pattern = r"(?:experiments|tests|notebooks|roge_jax)/[\w/]+\.(?:py|jsonl?|ipynb|md|png)"
     faults = [name for name in re.findall(pattern, page.read_text()) if not (ROOT / name).exists()]
     expected = {"experiments/results/train_profile.json"}  # written by a command
     assert not set(faults) - expected, faults
-
-
-def parser_of(module, monkeypatch) -> argparse.ArgumentParser:
-    """The options of a program, also of one that makes its parser on the way."""
-    if hasattr(module, "parser"):
-        return module.parser()
-    found = []
-    monkeypatch.setattr(module, "execute", lambda run, parser, arguments: found.append(parser) or 0)
-    assert module.main([]) == 0
-    return found[0]
 
 
 def options(parser: argparse.ArgumentParser) -> list[str]:
@@ -100,25 +121,20 @@ def options(parser: argparse.ArgumentParser) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize(
-    ("module", "pages"),
-    [
-        (sample, ["sampling"]),
-        (train, ["training", "scaling"]),
-        (evaluate, ["metrics"]),
-        (convert, ["weights"]),
-        (export, ["weights"]),
-        (check, ["own_photos"]),
-        (pack, ["own_photos"]),
-        (procedural_program, ["figures"]),  # python -m roge_jax.procedural
-    ],
-    ids=lambda x: x.__name__.rpartition(".")[2] if inspect.ismodule(x) else "",
-)
-def test_every_option_is_explained(module, pages, monkeypatch):
-    text = "".join((ROOT / "docs" / f"{page}.md").read_text() for page in pages)
-    names = options(parser_of(module, monkeypatch))
-    missing = [name for name in names if f"`{name}`" not in text]
+@pytest.mark.parametrize("module", list(made_options.programs()), ids=made_options.name)
+def test_every_option_is_explained(module):
+    """In the section of its program, with words beside it."""
+    sections = made_options.PAGE.read_text().split("\n## ")
+    text = next(one for one in sections if one.startswith(f"{made_options.name(module)}\n"))
+    names = options(made_options.parser(module))
+    missing = [name for name in names if not re.search(rf"`{name}`[^|]*\|[^|]*\| \w", text)]
     assert len(names) > 4 and not missing, missing
+
+
+def test_all_programs_are_found():
+    """Those of the tests of this folder, and the two that make their parser on the way."""
+    found = {made_options.name(module) for module in made_options.programs()}
+    assert {*PARSERS, "data.pack", "procedural"} <= found
 
 
 def test_the_renderers_benchmark_prints_what_its_page_says(monkeypatch, capsys):
@@ -139,14 +155,18 @@ def test_the_renderers_benchmark_prints_what_its_page_says(monkeypatch, capsys):
     printed = json.loads(capsys.readouterr().out)
     rates = printed["first_call_seconds"], printed["frames_per_second"]
     assert rates == (60.0, 48.0) and printed["frames_per_cpu_second"] == 96.0
-    text = (ROOT / "docs" / "figures.md").read_text()
+    text = FIGURES.read_text()
     assert "roge_jax.procedural bench" in text
     assert [name for name in printed if f"`{name}`" not in text] == []
 
 
 def test_every_chart_and_experiment_can_be_made_again():
-    text = (ROOT / "docs" / "figures.md").read_text()
-    charts = [*(ROOT / "docs").glob("*.png"), *(ROOT / "experiments" / "results").glob("*.png")]
+    text = FIGURES.read_text()
+    charts = [
+        *(ROOT / "docs").rglob("*.png"),
+        *(ROOT / "docs").rglob("*.svg"),
+        *(ROOT / "experiments" / "results").glob("*.png"),
+    ]
     programs = [
         f"python -m {'.'.join(file.relative_to(ROOT).with_suffix('').parts)}"
         for file in (ROOT / "experiments").rglob("*.py")
@@ -160,7 +180,9 @@ def test_every_chart_and_experiment_can_be_made_again():
 
 def test_every_page_is_listed_in_the_readme():
     text = (ROOT / "README.md").read_text()
-    missing = [page.name for page in PAGES[1:] if f"docs/{page.name}" not in text]
+    missing = [
+        called(page) for page in PAGES[1:] if f"({page.relative_to(ROOT).as_posix()})" not in text
+    ]
     assert not missing, missing
 
 
@@ -177,5 +199,9 @@ def test_the_checks_see_faults(tmp_path):
     page.write_text("# A title: one\n\n`python -m roge_jax.sample --nothing` and more --other\n")
     assert anchors(page) == {"a-title-one"}
     assert commands(page.read_text()) == [("sample", ["--nothing"])]
+    page.write_text(
+        "```bash\npython -m roge_jax.sample --seed 1 # x\n```\n\n    python -m roge_jax.check a   b\n"
+    )
+    assert blocks(page.read_text()) == [("sample", ["--seed", "1"]), ("check", ["a"])]
     with pytest.raises(Exception, match="nothing"):
         entry.parse(sample.parser(), ["--nothing"])

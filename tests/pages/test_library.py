@@ -1,4 +1,4 @@
-"""The Python of docs/library.md runs as it is printed, on the tiny model, in a folder of its own (slow: it compiles
+"""The Python of docs/howto/library.md runs as it is printed, on the tiny model, in a folder of its own (slow: it compiles
 every stage); its table names all that is public."""
 
 import re
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-PAGE = (Path(__file__).parents[2] / "docs" / "library.md").read_text()
+PAGE = (Path(__file__).parents[2] / "docs" / "howto" / "library.md").read_text()
 LOAD = 'params, config = rj.load("mini")\n'
 TINY = (
     'config = rj.preset("tiny")\nparams = rj.model.init(jax.random.key(0), config)\n'

@@ -1,5 +1,7 @@
-"""The notebooks run from the first cell to the last in time, and their two forms are the same."""
+"""The notebooks run from the first cell to the last in time, their two forms are the same, and they store their pictures."""
 
+import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -28,9 +30,36 @@ def test_notebook_runs(source, tmp_path):
 
 
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
-def test_paired_notebook_has_the_same_cells_and_no_outputs(source):
+def test_paired_notebook_has_the_same_cells(source):
     jupytext = pytest.importorskip("jupytext")
     script = jupytext.read(source)
     paired = jupytext.read(source.with_suffix(".ipynb"))
     assert [c.source for c in script.cells] == [c.source for c in paired.cells]
-    assert all(not c.get("outputs") for c in paired.cells)
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
+def test_paired_notebook_stores_what_it_shows(source):
+    """`make notebook` ran all of it: every cell that prints has its output, none failed, and there is a picture."""
+    file = source.with_suffix(".ipynb")
+    cells = [c for c in json.loads(file.read_text())["cells"] if c["cell_type"] == "code"]
+    assert file.stat().st_size < 1_500_000
+    counts = [cell["execution_count"] for cell in cells]
+    assert counts == sorted(counts) and None not in counts
+    assert all(cell["outputs"] for cell in cells if "print(" in "".join(cell["source"]))
+    outputs = [output for cell in cells for output in cell["outputs"]]
+    assert not [output for output in outputs if output["output_type"] == "error"]
+    assert any("image/png" in output.get("data", {}) for output in outputs)
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
+def test_the_first_code_installs_only_where_nothing_is_installed(source, monkeypatch):
+    """As on Colab. In a checkout, and where the package is installed, nothing is called."""
+    jupytext = pytest.importorskip("jupytext")
+    first = next(c.source for c in jupytext.read(source).cells if c.cell_type == "code")
+    called = []
+    monkeypatch.setattr(subprocess, "run", lambda words, **options: called.append(words))
+    exec(first, {})
+    assert not called
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    exec(first, {})
+    assert called[0][1:4] == ["-m", "pip", "install"] and "roge_jax" in first

@@ -512,7 +512,7 @@ def test_files_that_are_no_scenes_are_called_what_they_are(tmp_path, name, conte
 def test_folders_that_are_no_scenes(tmp_path):
     save(tmp_path / "mine" / "IMG_1.jpg", picture(0))
     (tmp_path / "mine" / "README.txt").write_text("my photos\n")
-    with pytest.raises(UserError, match=r"1 photos without poses: docs/own_photos.md"):
+    with pytest.raises(UserError, match=r"1 photos without poses: docs/start/own_photos.md"):
         load_scene(tmp_path / "mine")
     (tmp_path / "films").mkdir()
     (tmp_path / "films" / "walk.mov").write_bytes(b"")

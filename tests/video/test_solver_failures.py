@@ -1,4 +1,4 @@
-"""Where samplers fail, and that the remedy in the code is what mends it (docs/solvers.md)."""
+"""Where samplers fail, and that the remedy in the code is what mends it (docs/results/solvers.md)."""
 
 import itertools
 

@@ -180,7 +180,7 @@ def test_memory_follows_the_largest_tensor_not_the_file(tmp_path):
 
 
 def converted(tmp_path, source, command, largest):
-    """Convert in a process of its own, within the promised memory; prints what docs/weights.md quotes."""
+    """Convert in a process of its own, within the promised memory; prints what docs/reference/weights.md quotes."""
     begin = time.monotonic()
     (peak,) = measured(tmp_path, [], command)
     seconds, bound = time.monotonic() - begin, 3 * largest + 1e9

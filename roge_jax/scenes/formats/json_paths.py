@@ -60,7 +60,7 @@ def _told(content: dict, reading: Reading) -> Reading:
     if unused:
         reading.note(
             f"fields that are not used: {', '.join(unused[:8])}",
-            "docs/cameras.md lists those that are",
+            "docs/reference/formats.md lists those that are",
         )
     return reading
 
@@ -105,7 +105,7 @@ def _usable(entry: dict, field: str, where: str) -> np.ndarray:
 def read_own(
     content: dict, file: Path, *, convention: str | None, target: entries.Size | None
 ) -> Reading:
-    """`convention`, intrinsics, and `frames` or `keyframes` with a `pose` each (docs/cameras.md)."""
+    """`convention`, intrinsics, and `frames` or `keyframes` with a `pose` each (docs/reference/formats.md)."""
     if "frames" in content and "keyframes" in content:
         raise UserError(f"{file}: has both 'frames' and 'keyframes': give one of the two.")
     listed = _entries(content, ("frames", "keyframes"), "pose", file)
