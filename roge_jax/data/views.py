@@ -39,7 +39,8 @@ def draw_views(rng: np.random.Generator, frames: int, m: int, cfg: ViewConfig):
     if not cfg.ordered:
         span = frames
         if rng.random() < cfg.near:
-            span = int(rng.integers(min(frames, max(m + 2, 5)), max(frames // 2, m + 3) + 1))
+            longest = min(frames, max(frames // 2, m + 3))
+            span = int(rng.integers(min(longest, max(m + 2, 5)), longest + 1))
         start = int(rng.integers(0, frames - span + 1))
         contexts = start + rng.choice(span, m, replace=False)
         targets = start + rng.choice(span, n, replace=span < n)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from ..core.params import Tree
 from .aggregate import box, cheapest, envelope, occupied, semi_global, with_belief
-from .matching import described, evidence
+from .matching import Described, described, evidence
 from .rendering import Photos
-from .sweep import Motion, Texels, all_cuts, fetch, inverse_depth, pixels_of
+from .sweep import Motion, all_cuts, inverse_depth, pixels_of
 
 FINER = 2  # times the model's sides, the fine level
 LABELS = 16  # depths that the fine level compares
@@ -25,12 +25,12 @@ WINDOW, FINE_WINDOW = 2, 1  # pixels about which the evidence of either level is
 class Level(NamedTuple):
     """Photos of one fineness, and what they are compared by."""
 
-    texels: Texels
+    described: Described
     photos: Photos
 
     @classmethod
     def of(cls, match: Tree | None, photos: Photos) -> "Level":
-        return cls(Texels.of(described(match, photos.rgb)), photos)
+        return cls(described(match, photos.rgb), photos)
 
 
 class Surfaces(NamedTuple):
@@ -69,9 +69,14 @@ def surfaces(
         where = pixels_of(h, w, (size[0] / h, size[1] / w))
         photos = level.photos
         frames = (photos.size[:, 0], photos.size[:, 1])
-        values, seen = fetch(level.texels, photos.into(way), where, inverse, frames)
-        found = evidence(match, values, seen, alike).reshape(-1, h, w)
-        return box(found, window), seen.sum(0).reshape(-1, h, w)
+        into = photos.into(way)
+
+        def one(inverse):  # a cut at a time stays in the caches
+            values, seen = level.described.at(into, where, inverse[None], frames)
+            return evidence(match, values, seen, alike)[0], seen.sum(0)[0]
+
+        found, seen = jax.lax.map(one, inverse)
+        return box(found.reshape(-1, h, w), window), seen.reshape(-1, h, w)
 
     every = all_cuts(cuts, h * w, reach)
     cut = cheapest(semi_global(with_belief(*matched(levels[0], every, h, w, WINDOW), belief)))

@@ -5,12 +5,15 @@ show the same point if theirs point the same way. It is trained on rendered scen
 and compares photos only: what a view's depth is follows from the aggregation (`recon.aggregate`).
 """
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from ..core.layers import conv2d, conv2d_specs
 from ..core.params import Spec, Tree, ones
-from .aggregate import box, with_structure
+from .aggregate import with_structure
+from .sweep import Motion, Size, Texels, fetch, meet, nearest
 
 HIDDEN, VECTOR = 16, 8  # channels of the layers, and of each of the two descriptions of a pixel
 STRANGE = -4.0  # evidence for a cut that no two photos see, in units of a logit
@@ -22,7 +25,7 @@ VECTORS = 4.0  # what full agreement of two vectors weighs before training
 
 
 def matching_specs() -> Tree:
-    """Leaves of `described` and `evidence`."""
+    """Leaves of `vectors` and `evidence`."""
     near = (
         ("conv1", 4, HIDDEN),
         ("conv2", HIDDEN, HIDDEN),
@@ -40,14 +43,35 @@ def matching_specs() -> Tree:
     }
 
 
-def described(p: Tree | None, photos: jax.Array) -> jax.Array:
-    """Photos [m, h, w, 3] in [0, 1] with what they are compared by in front: [m, h, w, 2 VECTOR + 4].
+class Described(NamedTuple):
+    """Photos of one size as they are compared, ready to be read from."""
 
-    Of a model without these leaves (None) colour and structure alone, [m, h, w, 4].
-    """
+    plain: Texels  # colour and structure, read between pixels
+    vectors: (
+        jax.Array | None
+    )  # [m h w, 2 VECTOR] unit vectors, read at the nearest pixel; None: not learned
+
+    def at(self, way: Motion, pixels: jax.Array, inverse: jax.Array, size: Size):
+        """Values [m, k, p, 2 VECTOR + 4] where one view's rays meet their cuts, and whether they are seen (`sweep.fetch`)."""
+        values, seen = fetch(self.plain, way, pixels, inverse, size)
+        if self.vectors is None:
+            return values, seen
+        x, y, _ = meet(way, pixels, inverse, size)
+        h, w = self.plain.size
+        first = jnp.arange(len(x), dtype=jnp.int32)[:, None, None] * (h * w)
+        return jnp.concatenate([nearest(self.vectors, x, y, (h, w), first), values], -1), seen
+
+
+def described(p: Tree | None, photos: jax.Array) -> Described:
+    """Photos [m, h, w, 3] in [0, 1] as they are compared. Without leaves (None) by colour and structure alone."""
     photos = with_structure(photos)
     if p is None:
-        return photos
+        return Described(Texels.of(photos), None)
+    return Described(Texels.of(photos), vectors(p, photos).reshape(-1, 2 * VECTOR))
+
+
+def vectors(p: Tree, photos: jax.Array) -> jax.Array:
+    """The two unit vectors of every pixel [m, h, w, 2 VECTOR] of photos with structure [m, h, w, 4]."""
     near, wide = p["near"], p["wide"]
     y = jnp.concatenate([photos[..., :3] - 0.5, photos[..., 3:] / 3.0], -1)
     y = jax.nn.relu(conv2d(near["conv1"], y))
@@ -58,7 +82,7 @@ def described(p: Tree | None, photos: jax.Array) -> jax.Array:
     z = jax.nn.relu(conv2d(wide["conv1"], z))
     z = z + jax.nn.relu(conv2d(wide["conv2"], z))
     z = jax.image.resize(_unit(conv2d(wide["conv3"], z)), (m, h, w, VECTOR), "linear")
-    return jnp.concatenate([_unit(conv2d(near["conv4"], y)), z, photos], -1)
+    return jnp.concatenate([_unit(conv2d(near["conv4"], y)), z], -1)
 
 
 def _unit(x: jax.Array) -> jax.Array:
@@ -66,7 +90,7 @@ def _unit(x: jax.Array) -> jax.Array:
 
 
 def evidence(p: Tree | None, values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Array:
-    """Logits [k, p] of cuts: values [m, k, p, c] of `described` there, seen [m, k, p].
+    """Logits [k, p] of cuts: values [m, k, p, c] and seen [m, k, p] by `Described.at`.
 
     The best of the pairs of photos from different places (`alike`: `sweep.twins`) decides, softly, since one of a pair
     may look at something in front.
@@ -100,16 +124,3 @@ def _agreement(p: Tree | None, a: jax.Array, b: jax.Array) -> jax.Array:
     )
     w = p["weights"]
     return VECTORS * (w[0] * near + w[1] * wide) - w[2] * colour - w[3] * structure
-
-
-def volume(
-    p: Tree | None,
-    values: jax.Array,
-    seen: jax.Array,
-    alike: jax.Array,
-    h: int,
-    w: int,
-    window: int,
-):
-    """`evidence` of a view's pixels, averaged over windows of 2 `window` + 1: [k, h, w]."""
-    return box(evidence(p, values, seen, alike).reshape(-1, h, w), window)

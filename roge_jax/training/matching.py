@@ -5,20 +5,21 @@ The loss is the cross entropy of the cuts of a target view's rays against the cu
 count whose point two photos see. Photos differ in exposure and have noise, as those of a camera.
 """
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from ..core.lora import attach
 from ..core.params import Tree
+from ..model import over_scenes
 from ..recon.aggregate import box, occupied
 from ..recon.depth import FINE_WINDOW
 from ..recon.matching import described, evidence
 from ..recon.sweep import (
     Motion,
-    Texels,
     cut_at,
-    fetch,
     in_pixels_of,
     inverse_depth,
     meet_at,
@@ -34,6 +35,15 @@ EXPOSURE, WHITE, NOISE = (
     0.02,
 )  # deviations of a photo's gain, of a channel's, and of its noise at most
 FURTHER = 1.2  # cuts reach up to e to this times nearer than the scene does
+
+
+def objective(trainable, frozen, batch, key, *, config, stage):
+    """`matching_terms` of a batch of scenes (`training.stages`)."""
+    match = attach(frozen, trainable)["renderer"]["lookup"]["match"]
+    keys = jax.random.split(key, batch["K"].shape[0])
+    term = functools.partial(matching_terms, cuts=config.renderer.lookup)
+    terms = {k: v.mean() for k, v in over_scenes(term, match, batch, keys).items()}
+    return terms["loss"], {"right": terms["right"]}
 
 
 def matching_terms(
@@ -78,8 +88,12 @@ def _level(photos, side: int, cuts, match, way, photo_depth, inverse, alike, key
     _, h, w, _ = photos.shape
     k = len(cuts)
     row, column = jax.random.split(key)
-    top = jax.random.randint(row, (PATCHES, 1, 1), 0, h - SIDE + 1) + jnp.arange(SIDE)[None, :, None]
-    left = jax.random.randint(column, (PATCHES, 1, 1), 0, w - SIDE + 1) + jnp.arange(SIDE)[None, None]
+    top = (
+        jax.random.randint(row, (PATCHES, 1, 1), 0, h - SIDE + 1) + jnp.arange(SIDE)[None, :, None]
+    )
+    left = (
+        jax.random.randint(column, (PATCHES, 1, 1), 0, w - SIDE + 1) + jnp.arange(SIDE)[None, None]
+    )
     y, x = (z.reshape(-1) for z in jnp.broadcast_arrays(top, left))
     true = inverse[side * y + side // 2, side * x + side // 2]
     where = jnp.stack([x + 0.5, y + 0.5], -1)
@@ -93,12 +107,8 @@ def _level(photos, side: int, cuts, match, way, photo_depth, inverse, alike, key
     there = ratio / true[None]
     seen = seen * (jnp.abs(theirs - there) < SAME * there)
 
-    values, inside = fetch(
-        Texels.of(described(match, photos)),
-        own,
-        where,
-        jnp.broadcast_to(cuts[:, None], (k, len(true))),
-    )
+    many = jnp.broadcast_to(cuts[:, None], (k, len(true)))
+    values, inside = described(match, photos).at(own, where, many, (h, w))
     logits = evidence(match, values, inside, alike).reshape(k * PATCHES, SIDE, SIDE)
     logits = jax.nn.log_softmax(box(logits, FINE_WINDOW).reshape(k, -1), 0)
     at = jnp.interp(true, cuts, jnp.arange(k, dtype=jnp.float32))

@@ -22,8 +22,7 @@ from ..errors import UserError, did_you_mean
 from ..recon.depth import FINER
 from ..recon.picture import decode_all
 from ..video import dit, vae, vae_training
-from . import encoded
-from .matching import matching_terms
+from . import encoded, matching
 from .optim import OptimConfig
 
 
@@ -83,15 +82,6 @@ def recon_objective(trainable, frozen, batch, key, *, config, stage):
     return loss, told | {"psnr_photos": -10 * jnp.log10(terms["photos"])}
 
 
-def match_objective(trainable, frozen, batch, key, *, config, stage):
-    """How well photos are matched along the rays of a target view of known depth (`training.matching`)."""
-    match = attach(frozen, trainable)["renderer"]["lookup"]["match"]
-    keys = jax.random.split(key, batch["K"].shape[0])
-    term = functools.partial(matching_terms, cuts=config.renderer.lookup)
-    terms = {k: v.mean() for k, v in model.over_scenes(term, match, batch, keys).items()}
-    return terms["loss"], {"right": terms["right"]}
-
-
 def prior_objective(trainable, frozen, batch, key, *, config, stage):
     """Flow matching without rays or geometry: photos to video, the generator that RoGe starts from."""
     params = attach(frozen, trainable)
@@ -141,7 +131,7 @@ READS = {
 OBJECTIVES = {
     "vae": vae_objective,
     "recon": recon_objective,
-    "match": match_objective,
+    "match": matching.objective,
     "prior": prior_objective,
     "joint": joint_objective,
     "encoded": encoded_objective,
@@ -155,8 +145,6 @@ _GENTLE = dataclasses.replace(_SCRATCH, learning_rate=1e-3)
 
 # One scene a step on a trained model: steps of twice the rate undo more than they learn (docs/notes/making_mini.md).
 _FINE = dataclasses.replace(_SCRATCH, learning_rate=2e-4, warmup=10, betas=(0.9, 0.98), ema=0.99)
-
-
 # Small convolutions, many with one output: Muon was not tried.
 _SMALL = dataclasses.replace(_SCRATCH, name="adamw", warmup=30, betas=(0.9, 0.98))
 
@@ -170,17 +158,15 @@ JOINT = "^(dit|fusion|encoder|renderer/(?!lookup/match/))"
 def mini_stages(
     scale: float = 1.0, *, frames: int = 17, size: tuple[int, int] = (64, 112)
 ) -> list[Stage]:
-    """The recipe of the shipped small model, in order; `scale` multiplies every number of steps.
-
-    `size`: of its pictures, whose shorter side crops do not exceed.
-    """
+    """The recipe of the shipped small model, in order; `scale` multiplies steps, crops fit into pictures of `size`."""
     crop, fine = min(64, *size), (FINER * size[0], FINER * size[1])
     video = ViewConfig(targets=frames, ordered=True)
     images = ViewConfig(targets=1)
     short = ViewConfig(targets=5, ordered=True)
     views = ViewConfig(targets=8, near=0.5)
     few = ViewConfig(targets=4, near=0.5, faults=0.3, context_weights=(0.05, 0.35, 0.4, 0.2))
-    pairs = ViewConfig(*((2, 3, 4), (0.4, 0.35, 0.25)), targets=1, near=0.5, size=fine, depth=True)
+    two, often = (2, 3, 4), (0.4, 0.35, 0.25)
+    pairs = ViewConfig(two, often, targets=1, near=0.5, size=fine, depth=True)
     stages = [
         Stage("vae_images", "vae", "^vae/", 1000, 6, _SCRATCH, images),
         Stage("vae_clips", "vae", "^vae/", 500, 2, _SCRATCH, short, crop=crop),

@@ -98,6 +98,16 @@ def test_ordered_targets_are_a_run_of_frames_in_either_direction():
     assert np.mean(first) < 0.5  # the world frame is any of the contexts
 
 
+@pytest.mark.parametrize("frames", [4, 5, 6, 7])
+def test_a_short_stretch_of_few_frames_is_all_of_them_at_most(frames):
+    for seed in range(50):
+        contexts, targets = draw_views(
+            np.random.default_rng(seed), frames, 4, ViewConfig(targets=1, near=1.0)
+        )
+        assert len(set(contexts)) == 4 and min(contexts) >= 0 and max(contexts) < frames
+        assert 0 <= targets[0] < frames
+
+
 def test_unordered_views_may_come_from_a_short_stretch():
     cfg = ViewConfig(targets=6, near=1.0)
     spans = []

@@ -58,13 +58,26 @@ def test_a_single_photo_gives_no_evidence(match):
 
 def test_descriptions_are_unit_vectors_in_front_of_colour_and_structure(match):
     photos = RNG.random((2, 11, 14, 3)).astype(np.float32)  # also of odd sizes
-    found = np.asarray(matching.described(match, jnp.asarray(photos)))
-    assert found.shape == (2, 11, 14, CHANNELS)
-    near = np.linalg.norm(found[..., : matching.VECTOR], axis=-1)
-    assert np.all(near <= 1.0 + 1e-5) and np.median(near) > 0.99
-    np.testing.assert_array_equal(found[..., -4:-1], photos)
-    plain = np.asarray(matching.described(None, jnp.asarray(photos)))
-    np.testing.assert_array_equal(found[..., -4:], plain)
+    still = sweep.Motion(jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.zeros((2, 3)))
+    where, once = sweep.pixels_of(11, 14, 1), jnp.ones((1, 11 * 14))
+    read = [
+        matching.described(p, jnp.asarray(photos)).at(still, where, once, (11, 14))[0]
+        for p in (match, None)
+    ]
+    found, plain = (np.asarray(x).reshape(2, 11, 14, -1) for x in read)
+    assert found.shape == (2, 11, 14, CHANNELS) and plain.shape == (2, 11, 14, 4)
+    vectors = found[..., : 2 * matching.VECTOR].reshape(2, 11, 14, 2, matching.VECTOR)
+    lengths = np.linalg.norm(vectors, axis=-1)
+    assert np.all(lengths <= 1.0 + 1e-5) and np.median(lengths[..., 0]) > 0.99
+    np.testing.assert_allclose(found[..., -4:], plain, atol=1e-6)
+    np.testing.assert_allclose(plain[..., :3], photos, atol=1e-2)  # the border's is half a pixel in
+    inner = np.s_[:, 1:-1, 1:-1]
+    np.testing.assert_allclose(plain[..., :3][inner], photos[inner], atol=1e-4)
+    # A pixel's vectors are its own, wherever in it they are read.
+    shifted = sweep.Motion(still.turn.at[:, 0, 2].set(0.4), still.shift)
+    again = matching.described(match, jnp.asarray(photos)).at(shifted, where, once, (11, 14))[0]
+    again = np.asarray(again).reshape(2, 11, 14, -1)[..., : 2 * matching.VECTOR]
+    np.testing.assert_array_equal(again, found[..., : 2 * matching.VECTOR])
 
 
 @pytest.mark.parametrize("learned", [False, True])

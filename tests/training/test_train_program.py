@@ -60,7 +60,9 @@ def test_a_model_without_look_up_has_no_stage_for_it(tmp_path):
         name: [stage.name for stage in train.choose(args, config.preset(name))[1]]
         for name in ("tiny", "mini")
     }
-    assert names["mini"] == [*names["tiny"][:5], "lookup", *names["tiny"][5:]]
+    assert names["mini"] == [*names["tiny"][:5], "lookup", "match", *names["tiny"][5:]]
+    with pytest.raises(UserError, match=r"renderer\.matching is false"):
+        run("tiny", "--stage", "match", "--out", tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +83,9 @@ def test_numbers_that_mean_nothing_are_refused(words, tmp_path, capsys):
 def test_a_stage_gets_what_its_objective_reads():
     """Trained and frozen leaves together are the modules that the objective needs, and `vae_decoder` keeps latents."""
     cfg = config.preset("tiny")
-    needs = {"vae": {"vae"}, "recon": {"encoder", "renderer"}}
+    matching = dataclasses.replace(cfg.renderer, lookup=8, matching=True)
+    cfg = dataclasses.replace(cfg, renderer=matching)
+    needs = {"vae": {"vae"}, "recon": {"encoder", "renderer"}, "match": {"renderer"}}
     for stage in stages.mini_stages(frames=cfg.frames):
         trained, frozen = (flatten(tree) for tree in stages.stage_specs(cfg, stage))
         assert not set(trained) & set(frozen)

@@ -1,16 +1,20 @@
 """The recipe of `--stage all` and the paper's two stages at its end, on the tiny preset."""
 
+import dataclasses
 import itertools
 import json
 import shutil
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from train_runs import run, same, write_pool
 
 from roge_jax import config, model, train
 from roge_jax.checkpoint import load_model, save_model
+from roge_jax.core.params import flatten
+from roge_jax.data.pool import write_pool as procedural_pool
 from roge_jax.errors import UserError
 from roge_jax.training import stages
 
@@ -25,7 +29,7 @@ def test_all_stages_run_and_go_on_after_an_interruption(
     options = [*common, "--stage", "all", "--data", pool, "--steps", 2, "--batch", 1]
     run(*options, "--out", tmp_path / "whole")
     cfg = config.preset("tiny")
-    recipe = [s.name for s in stages.mini_stages() if not s.lookup]
+    recipe = [s.name for s in stages.mini_stages() if not s.lookup and s.objective != "match"]
     order = [*recipe, "lora", "hires"]
     assert {p.name for p in (tmp_path / "whole").iterdir()} == set(order)
     whole = {name: load_model(tmp_path / "whole" / name / "model") for name in order}
@@ -112,3 +116,42 @@ def test_scale_multiplies_the_steps_of_any_stage(name):
     assert steps("--scale", "0.5") == [n / 2 for n in steps()]
     assert set(steps("--scale", "1e-6")) == {1}
     assert set(steps("--scale", "0.5", "--steps", "7")) == {7}
+
+
+def test_matching_features_are_trained_on_a_pool_with_depth(tmp_path):
+    """The stage changes its own leaves alone, resumes exactly, and says what it needs."""
+    cfg = config.preset("tiny")
+    renderer = dataclasses.replace(cfg.renderer, lookup=8, matching=True)
+    cfg = dataclasses.replace(cfg, renderer=renderer)
+    params = model.init(jax.random.key(0), cfg)
+    save_model(tmp_path / "start", params, cfg, dtype=np.float32)
+    size = (stages.FINER * cfg.height, stages.FINER * cfg.width)
+    seeds, options = range(2), {"supersample": 1, "varied": True}
+    for name, depth in (("bare", False), ("pool", True)):
+        procedural_pool(tmp_path / name, seeds, 6, *size, depth=depth, **options)
+    words = [
+        "tiny",
+        "--init",
+        tmp_path / "start",
+        "--stage",
+        "match",
+        "--devices",
+        1,
+        "--save-every",
+        1,
+    ]
+    with pytest.raises(UserError, match=r"bare: its scenes have no depth.*--depth"):
+        run(*words, "--steps", 1, "--data", tmp_path / "bare", "--out", tmp_path / "out")
+    words += ["--data", tmp_path / "pool"]
+    run(*words, "--steps", 2, "--out", tmp_path / "whole")
+    run(*words, "--steps", 1, "--out", tmp_path / "parts")
+    run(*words, "--steps", 2, "--out", tmp_path / "parts", "--resume")
+    first, whole, parts = (
+        flatten(load_model(tmp_path / name)[0])
+        for name in ("start", "whole/match/model", "parts/match/model")
+    )
+    changed = {path for path in first if not np.array_equal(first[path], whole[path])}
+    assert changed and all(path.startswith("renderer/lookup/match/") for path in changed)
+    log = [json.loads(x) for x in (tmp_path / "whole/match/log.jsonl").read_text().splitlines()]
+    assert np.isfinite(log[-1]["loss"]) and 0.0 <= log[-1]["right"] <= 1.0
+    assert set(parts) == set(whole)
