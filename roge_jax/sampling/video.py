@@ -104,7 +104,8 @@ class Result:
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
-def _check_photos(photos: Photos, config: RoGeConfig) -> None:
+def check_photos(photos: Photos, config: RoGeConfig) -> None:
+    """Raise UserError for photos of another size than the model's."""
     wanted = (len(photos.ids), config.height, config.width, 3)
     if np.shape(photos.images) != wanted or len(photos.cameras) != wanted[0]:
         raise UserError(
@@ -175,7 +176,7 @@ def sample(
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
-    _check_photos(photos, config)
+    check_photos(photos, config)
     if plan is not None:
         if tuple(plan.ids) != tuple(photos.ids):
             raise UserError(
@@ -273,7 +274,7 @@ def sample(
     return Result(
         np.concatenate(frames),
         np.concatenate(previews),
-        _at_frames(to_host(path), config),
+        at_frames(to_host(path), config),
         info,
         evaluations,
         tuple(told),
@@ -304,7 +305,7 @@ def at_output(
     return np.clip(full + change, 0.0, 1.0)
 
 
-def _at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
+def at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
     """Cameras with K in pixels of the frames instead of the model's."""
     return Cameras(scale_K(path.K, (config.height, config.width), config.output_size), path.c2w)
 

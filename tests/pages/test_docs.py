@@ -103,7 +103,7 @@ def options(parser: argparse.ArgumentParser) -> list[str]:
 @pytest.mark.parametrize(
     ("module", "pages"),
     [
-        (sample, ["sampling"]),
+        (sample, ["sampling", "howto/viewer"]),
         (train, ["training", "scaling"]),
         (evaluate, ["metrics"]),
         (convert, ["weights"]),
