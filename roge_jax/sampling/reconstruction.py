@@ -60,17 +60,40 @@ def encode(
     views |= {"K": views["K"][:-1], "c2w": views["c2w"][:-1]}
     views = jax.device_put(views, sharding.everywhere())
     with stage("compile"):
-        program = jax.jit(functools.partial(model.reconstruct, config=config))
+        program = jax.jit(functools.partial(_known, config=config))
         run = program.lower(*sharding.shapes((params, views))).compile()
     with stage("prepare"):
-        return Known(jax.block_until_ready(run(params, views)), views), info
+        return jax.block_until_ready(run(params, views)), info
+
+
+def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
+    full = views.get("full")
+    tokens = model.reconstruct(params, views, config=config)
+    return Known(tokens, views if full is None else views | {"full": full.prepared()})
+
+
+def among(known: Known, kept: jax.Array) -> Known:
+    """Some of the photos [k] of a scene: what is known of the others is not looked at."""
+    views = {name: x[kept] for name, x in known.views.items() if name != "full"}
+    if (full := known.views.get("full")) is not None:
+        rows = full.pyramid._replace(first=full.pyramid.first[:, kept])
+        parts = (x[kept] for x in full[:-1])
+        views["full"] = type(full)(*parts, pyramid=rows)
+    return Known(known.tokens[kept], views)
 
 
 def look(
-    params: Tree, known: Known, K: jax.Array, c2w: jax.Array, *, config: RoGeConfig
+    params: Tree,
+    known: Known,
+    K: jax.Array,
+    c2w: jax.Array,
+    kept: jax.Array | None = None,
+    *,
+    config: RoGeConfig,
 ) -> jax.Array:
     """The picture [n, H, W, 3] at the output's size of cameras K [n, 3, 3] in pixels of config.height x config.width, c2w
-    [n, 4, 4] normalised."""
+    [n, 4, 4] normalised. `kept`: of some of the photos alone (`among`)."""
+    known = known if kept is None else among(known, kept)
     views = {name: jnp.concatenate([known.views[name], x]) for name, x in (("K", K), ("c2w", c2w))}
     shown, full = programs.rgb_head(
         params, known.views | views, config=config, scene_tokens=known.tokens
@@ -78,14 +101,16 @@ def look(
     return model.resized(shown, *config.output_size) if full is None else full
 
 
-def compiled(params: Tree, known: Known, count: int, config: RoGeConfig) -> Callable:
-    """`look` for `count` cameras: (params, known, K, c2w) -> pictures."""
-    K, c2w = (
-        jax.ShapeDtypeStruct((count, n, n), jnp.float32, sharding=sharding.everywhere())
-        for n in (3, 4)
-    )
+def compiled(
+    params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None = None
+) -> Callable:
+    """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
+    shapes = [((count, n, n), jnp.float32) for n in (3, 4)]
+    shapes += [] if photos is None else [((photos,), jnp.int32)]
+    where = sharding.everywhere()
+    cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)
     program = jax.jit(functools.partial(look, config=config), out_shardings=sharding.everywhere())
-    return program.lower(*sharding.shapes((params, known)), K, c2w).compile()
+    return program.lower(*sharding.shapes((params, known)), *cameras).compile()
 
 
 def preview(

@@ -6,14 +6,16 @@ import json
 import jax
 import numpy as np
 import pytest
-from scene_files import nerfstudio, truth
+from scene_files import HEIGHT, WIDTH, nerfstudio, truth
 from test_stretches import photos, weights  # noqa: F401  fixtures: the tiny model, two photos
 
 from roge_jax import checkpoint, cost, model, sample, sampling
 from roge_jax.config import preset
 from roge_jax.files import entry, video_io
+from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import PRESETS, make_path, preset_options
 from roge_jax.sampling import reconstruction
+from roge_jax.scenes.scene import Scene
 
 CONFIG = preset("tiny")
 INDEPENDENT = sampling.Settings(steps=1, solver="euler", schedule="uniform", long="independent")
@@ -23,20 +25,17 @@ def parts(tree):
     return {name: tree[name] for name in reconstruction.PARTS}
 
 
-def finer() -> tuple:
-    """(config, parameters, photos) of a model that looks into photos and makes pictures twice its own size."""
+def finer(images: np.ndarray, **changes) -> tuple:
+    """(config, parameters, photos of `images` [k, 64, 96, 3]) of a model that looks into photos and makes pictures twice its
+    own size."""
     renderer = dataclasses.replace(CONFIG.renderer, attention="cross", lookup=6)
-    config = dataclasses.replace(CONFIG, renderer=renderer, output=(64, 96))
+    config = dataclasses.replace(CONFIG, renderer=renderer, output=(64, 96), **changes)
     params = model.init(jax.random.key(0), config)
-    scene_photos = np.random.default_rng(2).random((3, 64, 96, 3), np.float32)
-    cameras = truth(3)
-    scale = np.array([64 / 24, 96 / 40])
-    K = cameras.K * np.array([scale[1], scale[0], 1.0])[None, :, None]
-    from roge_jax.geometry.cameras import Cameras
-    from roge_jax.scenes.scene import Scene
-
-    scene = Scene(list(scene_photos), Cameras(K, cameras.c2w), ("a", "b", "c"), "three")
-    return config, params, sampling.read_photos(scene, [0, 1, 2], config)
+    cameras = truth(len(images))
+    stretched = cameras.K * np.array([96 / WIDTH, 64 / HEIGHT, 1.0])[None, :, None]
+    names = tuple(f"{i}.png" for i in range(len(images)))
+    scene = Scene(list(images), Cameras(stretched, cameras.c2w), names, "made here")
+    return config, params, sampling.read_photos(scene, range(len(images)), config)
 
 
 def test_it_is_the_preview_of_the_whole_sampler(weights, photos):  # noqa: F811
@@ -51,7 +50,7 @@ def test_it_is_the_preview_of_the_whole_sampler(weights, photos):  # noqa: F811
 
 
 def test_pictures_larger_than_the_model_are_those_of_the_sampler():
-    config, params, given = finer()
+    config, params, given = finer(np.random.default_rng(2).random((3, 64, 96, 3), np.float32))
     path = make_path("orbit", given.cameras, 3, degrees=10)
     whole = sampling.sample(params, config, given, path, INDEPENDENT)
     alone = sampling.preview(parts(params), config, given, path)
@@ -65,6 +64,17 @@ def test_a_scale_of_the_user_is_that_of_the_sampler(weights, photos):  # noqa: F
         sampling.preview(parts(weights), CONFIG, photos, path, scale=3.0).normalisation.divisor
         == 3.0
     )
+
+
+@pytest.mark.parametrize("recon", [(32, 48), (16, 24)], ids=["model's size", "half of it"])
+def test_from_where_a_photo_was_taken_one_sees_the_photo(recon):
+    """Whatever the size at which the reconstruction looks: depth does not matter there, only where pixels lie."""
+    y, x = np.mgrid[:64, :96] / 16.0
+    photo = np.stack([0.5 + 0.4 * np.sin(x), 0.5 + 0.4 * np.cos(y), 0.5 + 0.3 * np.sin(x + y)], -1)
+    sizes = {"recon_height": recon[0], "recon_width": recon[1]}
+    config, params, given = finer(photo[None].astype(np.float32), **sizes)
+    made = sampling.preview(parts(params), config, given, given.cameras).frames[0]
+    assert np.abs(made - photo)[4:-4, 4:-4].max() < 0.03
 
 
 @pytest.fixture(scope="module")
