@@ -17,7 +17,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from .files.entry import Clock, environment, number, one_of, run
+from .files.entry import Clock, number, one_of, run
 from .files.folders import output_folder, write_json
 from .sampling.inputs import (
     ALONE,
@@ -120,64 +120,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-# ---- outputs -------------------------------------------------------------------------------------
-
-
-def write_outputs(folder: Path, result, photos, fps: float, *, generated: bool = True) -> None:
-    """All files but run.json. Where nothing is generated the frames are the preview, which is not written twice."""
-    from .files import video_io
-    from .scenes.paths import transforms
-
-    height, width = result.frames.shape[1:3]
-    names = video_io.write_frames(folder / "frames", result.frames)
-    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
-    video_io.write_video(folder / "video.mp4", result.frames, fps)
-    rows = {"photos": photos.images}
-    if generated:
-        video_io.write_video(folder / "preview.mp4", result.preview, fps)
-        rows["generated"] = result.frames
-    rows["preview (reconstruction)"] = result.preview
-    video_io.write_png(folder / "contact_sheet.png", video_io.contact_sheet(rows))
-
-
-def record(
-    args: argparse.Namespace, config, settings, scene, photos, result, clock: Clock
-) -> dict[str, Any]:
-    """run.json: everything needed to know what was made and to make it again."""
-    from .config import to_dict
-
-    info = result.normalisation
-    return {
-        "program": "roge_jax.sample",
-        **environment(),
-        "arguments": vars(args),
-        "generated": not args.preview_only,
-        "settings": {"scale": settings.scale}
-        if args.preview_only
-        else dataclasses.asdict(settings),
-        "scene": {
-            "source": scene.source,
-            "photos": len(scene),
-            "context": list(photos.ids),
-            "context_names": [scene.names[i] for i in photos.ids],
-        },
-        "scale": {
-            "divisor": info.divisor,
-            "status": info.status,
-            "rule": info.rule,
-            "context_reach": info.context_reach,
-            "target_reach": info.target_reach,
-        },
-        "frames": len(result.frames),
-        "size": list(result.frames.shape[1:3]),
-        "evaluations": result.evaluations,
-        "windows": list(result.windows),
-        "warnings": [one._asdict() for one in result.warnings],
-        "stages": clock.record(),
-        "config": to_dict(config),
-    }
-
-
 # ---- the program ---------------------------------------------------------------------------------
 
 
@@ -189,6 +131,7 @@ def main(args: argparse.Namespace) -> None:
     from .core import sharding, target
     from .errors import UserError
     from .sampling import reconstruction
+    from .sampling.outputs import record, write_outputs
     from .sampling.scene_limits import Beside
 
     if args.trajectory == "list":
@@ -250,7 +193,18 @@ def main(args: argparse.Namespace) -> None:
             warnings.warn(note, stacklevel=2)
         with clock("write"):
             write_outputs(folder, result, photos, args.fps, generated=not args.preview_only)
-        content = record(args, config, settings, scene, photos, result, clock)
+        used = {"scale": args.scale} if args.preview_only else dataclasses.asdict(settings)
+        content = record(
+            "roge_jax.sample",
+            vars(args),
+            config,
+            used,
+            scene,
+            photos,
+            result,
+            clock,
+            generated=not args.preview_only,
+        )
         content |= {} if plan is None else {"plan": dataclasses.asdict(plan)}
         write_json(folder / "run.json", content)
     stages = ", ".join(
