@@ -65,8 +65,7 @@ def make_path(
       options: the preset's own keywords, e.g. orbit's `degrees`.
     Raises: UserError for an unknown name or option, or a start that is no context view.
     """
-    if not isinstance(name, str) or name not in PRESETS:
-        raise UserError(f"There is no trajectory '{name}': {did_you_mean(name, PRESETS)}")
+    defaults = preset_options(name)
     where = f"Trajectory '{name}'"
     context = checked_views(context, "context")
     frames, start = (
@@ -77,7 +76,7 @@ def make_path(
         raise UserError(f"A path of {frames} frames is empty: ask for 1 or more.")
     if not 0 <= start < len(context):
         raise UserError(f"start={start} is no context view: there are {len(context)}, from 0.")
-    preset, defaults = PRESETS[name], preset_options(name)
+    preset = PRESETS[name]
     for option, value in options.items():
         if option not in defaults:
             hint = did_you_mean(option, [*defaults, "start", "focus", "ease"])
@@ -97,6 +96,8 @@ def make_path(
 
 def preset_options(name: str) -> dict[str, Any]:
     """{option: its default} of a preset, beside the `start`, `focus` and `ease` that all of them have."""
+    if not isinstance(name, str) or name not in PRESETS:
+        raise UserError(f"There is no trajectory '{name}': {did_you_mean(name, PRESETS)}")
     every = list(inspect.signature(PRESETS[name]).parameters.values())
     return {p.name: p.default for p in every[2:]}
 

@@ -21,8 +21,7 @@ class Level:
     @property
     def size(self) -> tuple[int, int]:
         """(height, width) of its pictures."""
-        config = self.config
-        return config.output_size if config.renderer.lookup else recon_size(config)
+        return self.config.output_size
 
 
 def recon_size(config: RoGeConfig) -> tuple[int, int]:

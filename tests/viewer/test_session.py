@@ -175,7 +175,7 @@ def test_the_quick_level_looks_at_the_nearest_photos(live):
 
 
 def test_coverage_is_high_at_a_photo_and_nothing_behind_it(live, ours):
-    assert live.seen(view_of(ours, 1)) > 0.9
+    assert live.seen(view_of(ours, 1, fov=10.0)) > 0.9  # within what the photo shows
     behind = ours.given.photos.cameras.c2w[1].copy()
     behind[:3, :3] = behind[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     assert live.seen(View(behind, 45.0, 1.5)) < 0.1
