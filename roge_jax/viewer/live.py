@@ -104,6 +104,7 @@ class Shown(NamedTuple):
     view: View
     seconds: float
     rate: float  # pictures a second, lately
+    moving: bool  # at the level that is for moving
     finest: bool  # no finer one will come
     seen: float
 
@@ -177,7 +178,8 @@ class Worker:
             rate = self.desk.rate(task.who, now)
         if there:
             finest = task.level == len(live.levels) - 1
-            self.show(task.who, Shown(picture, task.camera, seconds, rate, finest, seen))
+            made = Shown(picture, task.camera, seconds, rate, task.level == moving, finest, seen)
+            self.show(task.who, made)
 
     def _build(self, level: int) -> None:
         """A level that cannot be built stays missing, and is not tried again: `building` is kept."""

@@ -21,7 +21,10 @@ from .panel import Panel
 from .session import Session
 
 PHOTO, KEY, CHOSEN, LINE = (40, 90, 200), (200, 90, 30), (240, 40, 40), (240, 150, 40)
-FRUSTUM = 0.12  # length of a frustum, in the distance of the scene
+FRUSTUM = (
+    0.12,
+    0.35,
+)  # length of a frustum: of the distance of the scene, of the photos' reach; the smaller one
 THUMBNAIL = 96  # pixels, height
 QUALITY = 85  # of the live picture's JPEG
 
@@ -34,6 +37,7 @@ class _Viewer:
     status: Any
     photos: list[Any]
     cameras: bool = True  # photos are shown
+    player: Any = None  # the window that plays a video
 
 
 class Page:
@@ -45,6 +49,7 @@ class Page:
         self.session, self.lock = session, threading.RLock()
         self.viewers: dict[int, _Viewer] = {}
         self.chosen: int | None = None  # key frame
+        self.dragging = False  # it has handles
         self.flying: set[int] = set()
         self.server = viser.ViserServer(host, port, label="roge_jax", verbose=False)
         self.address = f"http://{host}:{self.server.get_port()}"
@@ -73,6 +78,8 @@ class Page:
     def _place_cameras(self) -> None:
         session, server = self.session, self.server
         given, cameras = session.given, session.given.photos.cameras
+        reach = session.world.context_reach / session.world.divisor or np.inf
+        self.length = min(FRUSTUM[0] * session.focus, FRUSTUM[1] * reach)
         server.scene.set_up_direction(session.up)
         height, width = session.size
         pictures, _ = prepare(given.scene, given.photos.ids, height, width, drop_duplicates=False)
@@ -102,7 +109,7 @@ class Page:
             name,
             float(np.radians(fov)),
             width / height,
-            scale=FRUSTUM * self.session.focus,
+            scale=self.length,
             thickness=1.5,
             thickness_units="screen",
             color=color,
@@ -118,7 +125,7 @@ class Page:
 
     def _clear_sight(self, viewer: "_Viewer") -> None:
         """Photos that one stands at are not shown: they would hide what is behind them."""
-        position, near = viewer.client.camera.position, 2.0 * FRUSTUM * self.session.focus
+        position, near = viewer.client.camera.position, 2.0 * self.length
         for photo in viewer.photos:
             visible = viewer.cameras and np.linalg.norm(photo.position - position) > near
             if photo.visible != visible:
@@ -155,7 +162,7 @@ class Page:
         """What the chosen key frame is dragged by. It is kept while it is dragged, and moved only by others."""
         scene = self.server.scene
         held = scene.get_handle_by_name("/handle")
-        if self.chosen is None:
+        if self.chosen is None or not self.dragging:
             if held is not None:
                 held.remove()
             return
@@ -164,9 +171,13 @@ class Page:
             if np.abs(held.position - position).max() > 1e-6 or abs(held.wxyz @ wxyz) < 1 - 1e-9:
                 held.wxyz, held.position = wxyz, position
             return
-        scale = 1.5 * FRUSTUM * self.session.focus
         handle = scene.add_transform_controls(
-            "/handle", scale=scale, wxyz=wxyz, position=position, depth_test=False, opacity=0.7
+            "/handle",
+            scale=self.length,
+            wxyz=wxyz,
+            position=position,
+            disable_sliders=True,
+            depth_test=False,
         )
         handle.on_update(lambda event: self._dragged(event.target))
 
@@ -176,6 +187,11 @@ class Page:
                 return
             pose, number = self.session.pose_of(handle.wxyz, handle.position), self.chosen
             self.edit(lambda keys: keyframes.changed(keys, number, c2w=pose))
+
+    def drag(self, wanted: bool) -> None:
+        """Handles at the chosen key frame, or none: they are in the way where one stands."""
+        self.dragging = wanted
+        self._draw_path()
 
     def choose(self, number: int | None) -> None:
         """A key frame to work on."""
@@ -247,7 +263,7 @@ class Page:
             return
         viewer.client.scene.set_background_image(shown.picture, format="jpeg", jpeg_quality=QUALITY)
         height, width = shown.picture.shape[:2]
-        rate = f"**{shown.rate:.1f}** pictures/s · " if shown.rate >= 1 else ""
+        rate = f"**{shown.rate:.1f}** pictures/s · " if shown.moving and shown.rate >= 1 else ""
         viewer.status.content = (
             f"{rate}{height}x{width} · {1000 * shown.seconds:.0f} ms · "
             f"photos cover **{100 * shown.seen:.0f} %** of this view"

@@ -62,12 +62,13 @@ class Panel:
             self.told = gui.add_markdown("")
             self.frames = gui.add_number("Frames", start.frames, min=1, step=1)
             self.fps = gui.add_number("Frames per second", float(start.fps), min=0.1, step=0.1)
-            to_keys = gui.add_button("Turn into key frames")
+            self.turn = gui.add_button("Turn into key frames")
             add = gui.add_button("Add key frame here")
             self.key = gui.add_dropdown("Key frame", ["-"], initial_value="-")
             self.wait = gui.add_number("Seconds to it", 1.0, min=keyframes.LEAST, step=0.01)
             self.angle = gui.add_number("Its field of view", 40.0, min=1.0, max=179.0, step=0.1)
-            self.own = gui.add_button_group("It", ["go there", "move here", "delete"])
+            self.own = gui.add_button_group("This one", ["go there", "move here", "delete"])
+            self.drag = gui.add_checkbox("Handles to drag it", False)
             fly = gui.add_button("Fly along")
             name = gui.add_text("Name", "path")
             self.store = gui.add_button_group("Path file", ["save", "open saved", "download"])
@@ -88,7 +89,7 @@ class Panel:
         def _(event):
             self.session.change(lambda old: dataclasses.replace(old, fps=float(self.fps.value)))
 
-        @self.on(to_keys)
+        @self.on(self.turn)
         def _(event):
             context, size = self.session.given.photos.cameras, self.session.size
             self.session.change(lambda old: route.as_keys(old, context, size))
@@ -130,6 +131,10 @@ class Panel:
                 key = self.session.route.keys[number]
                 self.page.stand(event.client, key.c2w, key.fov)
 
+        @self.on(self.drag)
+        def _(event):
+            self.page.drag(self.drag.value)
+
         @self.on(fly)
         def _(event):
             self.page.fly(event.client)
@@ -158,7 +163,7 @@ class Panel:
             self.bar = gui.add_progress_bar(0.0, visible=False)
             self.said = gui.add_markdown("")
             self.video = gui.add_dropdown("Finished", ["-"], initial_value="-")
-            what = gui.add_button_group("It", ["play", "download"])
+            what = gui.add_button_group("This one", ["play", "download"])
             self.about = gui.add_markdown("")
 
         @self.on(make)
@@ -238,7 +243,8 @@ class Panel:
             self.told.content = "no key frames yet: go somewhere and add one"
         self.key.options = ["-", *(str(i + 1) for i in range(len(now.keys)))]
         self.key.value = "-" if chosen is None else str(chosen + 1)
-        for control in (self.key, self.wait, self.angle, self.own):
+        self.turn.visible = now.preset is not None
+        for control in (self.key, self.wait, self.angle, self.own, self.drag):
             control.visible = now.preset is None and bool(now.keys)
         if now.preset is None and chosen is not None:
             self.wait.value = float(now.keys[chosen].seconds)
@@ -306,18 +312,29 @@ class Panel:
             self.about.content = runs.about(run.folder)
 
     def _play(self, client: Any, folder: Any) -> None:
-        """The comparison in a window of its own, which the browser plays."""
+        """The comparison in a window of its own, which the browser plays; the window of the one before goes."""
         content = base64.b64encode((folder / runs.BESIDE).read_bytes()).decode()
         names = ["nearest photo", "preview", "video"][
             : 3 if (folder / "preview.mp4").exists() else 2
         ]
         heads = "".join(f"<span style='flex:1;text-align:center'>{name}</span>" for name in names)
-        with client.gui.add_modal(folder.name) as modal:
+        viewer = self.page.viewers[client.client_id]
+        if viewer.player is not None:
+            viewer.player.remove()
+        viewer.player = panel = client.gui.add_panel()
+        with panel.add_tab(folder.name):
             client.gui.add_html(
                 f"<div style='display:flex'>{heads}</div><video controls autoplay loop muted style='width:100%' "
                 f"src='data:video/mp4;base64,{content}'></video>"
             )
-            client.gui.add_button("Close").on_click(lambda _: modal.close())
+            close = client.gui.add_button("Close")
+        panel.float(width=max(400.0, 0.9 * client.camera.image_width))
+
+        @self.on(close)
+        def _(event):
+            if viewer.player is panel:
+                viewer.player = None
+                panel.remove()
 
 
 def _choices(name: str, value: Any) -> list[str]:
