@@ -53,17 +53,34 @@ def encode(
       scale only where the photos do not, as of a single one. scale: a divisor of all positions instead.
     """
     stage = stage or (lambda name: nullcontext())
+    views, info = of_photos(config, photos, near, scale=scale)
+    with stage("compile"):
+        run = encoder(params, views, config)
+    with stage("prepare"):
+        return jax.block_until_ready(run(params, views)), info
+
+
+def of_photos(
+    config: RoGeConfig, photos: Photos, near: Cameras, *, scale: float | None = None
+) -> tuple[model.Views, Normalisation]:
+    """(the views of the photos alone, the frame that they are in); arguments as of `encode`."""
     check_photos(photos, config)
     context, targets, info = normalise(photos.cameras, near, rule=config.scale_rule, scale=scale)
     seen = photos.images, photos.recon, context
     views = window_views(*seen, targets[:1], info, config, frames=1, full=photos.full)
     views |= {"K": views["K"][:-1], "c2w": views["c2w"][:-1]}
-    views = jax.device_put(views, sharding.everywhere())
-    with stage("compile"):
-        program = jax.jit(functools.partial(_known, config=config))
-        run = program.lower(*sharding.shapes((params, views))).compile()
-    with stage("prepare"):
-        return jax.block_until_ready(run(params, views)), info
+    return jax.device_put(views, sharding.everywhere()), info
+
+
+def encoder(params: Tree, views: model.Views, config: RoGeConfig) -> Callable:
+    """(params, views) -> `Known`, compiled for these shapes."""
+    program = jax.jit(functools.partial(_known, config=config))
+    return program.lower(*sharding.shapes((params, views))).compile()
+
+
+def known_shapes(params: Tree, views: model.Views, config: RoGeConfig) -> Known:
+    """What `encoder` makes, abstractly: `compiled` need not wait for it."""
+    return jax.eval_shape(functools.partial(_known, config=config), params, views)
 
 
 def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:

@@ -3,8 +3,10 @@
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from ..config import RoGeConfig
@@ -60,17 +62,27 @@ class Live:
 
     def build(self, level: int) -> None:
         """Encode the scene for a level, where no other has, and compile its program."""
-        config, few = self.levels[level].config, self._few(level)
+        config, params = self.levels[level].config, self.params
         key = recon_size(config)
-        if key not in self._known:
-            whole = key == recon_size(self.config)
-            photos = self.photos if whole else read_photos(self.scene, self.ids, config)
-            self._known[key] = reconstruction.encode(
-                self.params, config, photos, self.near, scale=self.scale
-            )
-        known, _ = self._known[key]
-        self._run[level] = reconstruction.compiled(self.params, known, 1, config, few)
+        if key in self._known:
+            known, _ = self._known[key]
+            self._run[level] = reconstruction.compiled(params, known, 1, config, self._few(level))
+        else:
+            self._build_both(level, key)
         self.ready[level] = True
+
+    def _build_both(self, level: int, key: tuple[int, int]) -> None:
+        """Encoding and program side by side: what the first picture waits for is their compilation."""
+        config, params = self.levels[level].config, self.params
+        whole = key == recon_size(self.config)
+        photos = self.photos if whole else read_photos(self.scene, self.ids, config)
+        views, info = reconstruction.of_photos(config, photos, self.near, scale=self.scale)
+        shapes = reconstruction.known_shapes(params, views, config)
+        with ThreadPoolExecutor(1) as pool:
+            run = pool.submit(reconstruction.compiled, params, shapes, 1, config, self._few(level))
+            known = reconstruction.encoder(params, views, config)(params, views)
+            self._known[key] = jax.block_until_ready(known), info
+            self._run[level] = run.result()
 
     def picture(self, level: int, view: View) -> np.ndarray:
         """What a viewer sees, uint8 [h, w, 3]; the time it took is kept in `pace`."""
