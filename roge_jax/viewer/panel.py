@@ -244,8 +244,9 @@ class Panel:
         self.key.options = ["-", *(str(i + 1) for i in range(len(now.keys)))]
         self.key.value = "-" if chosen is None else str(chosen + 1)
         self.turn.visible = now.preset is not None
-        for control in (self.key, self.wait, self.angle, self.own, self.drag):
-            control.visible = now.preset is None and bool(now.keys)
+        self.key.visible = now.preset is None and bool(now.keys)
+        for control in (self.wait, self.angle, self.own, self.drag):
+            control.visible = self.key.visible and chosen is not None
         if now.preset is None and chosen is not None:
             self.wait.value = float(now.keys[chosen].seconds)
             self.angle.value = float(now.keys[chosen].fov)

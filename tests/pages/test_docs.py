@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from roge_jax import check, convert, evaluate, export, sample, train
+from roge_jax import check, convert, evaluate, export, sample, train, view
 from roge_jax.data import pack
 from roge_jax.files import entry
 from roge_jax.procedural import __main__ as procedural_program
@@ -25,6 +25,7 @@ PARSERS = {
     "evaluate": evaluate,
     "convert": convert,
     "export": export,
+    "view": view,
 }
 
 
@@ -109,6 +110,7 @@ def options(parser: argparse.ArgumentParser) -> list[str]:
         (convert, ["weights"]),
         (export, ["weights"]),
         (check, ["own_photos"]),
+        (view, ["howto/viewer"]),
         (pack, ["own_photos"]),
         (procedural_program, ["figures"]),  # python -m roge_jax.procedural
     ],
