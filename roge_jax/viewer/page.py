@@ -62,6 +62,7 @@ class Page:
         self.panel = Panel(self)
         session.watch(self._changed)
         self._changed("path")
+        self._changed("run")  # videos of an earlier day
         self.server.on_client_connect(self._came)
         self.server.on_client_disconnect(self._went)
         threading.Thread(target=self._begin, daemon=True).start()
