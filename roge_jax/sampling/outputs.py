@@ -21,7 +21,7 @@ def write_outputs(
     names = video_io.write_frames(folder / "frames", result.frames)
     write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
     video_io.write_video(folder / "video.mp4", result.frames, fps)
-    rows = {"photos": photos.images}
+    rows: dict[str, Any] = {"photos": photos.images}
     if generated:
         video_io.write_video(folder / "preview.mp4", result.preview, fps)
         rows["generated"] = result.frames

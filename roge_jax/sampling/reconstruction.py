@@ -10,7 +10,7 @@ a generator; `roge_jax.viewer` asks for one camera at a time.
 import functools
 from collections.abc import Callable
 from contextlib import nullcontext
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,7 +122,7 @@ def compiled(
     params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None = None
 ) -> Callable:
     """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
-    shapes = [((count, n, n), jnp.float32) for n in (3, 4)]
+    shapes: list[tuple[tuple[int, ...], Any]] = [((count, n, n), jnp.float32) for n in (3, 4)]
     shapes += [] if photos is None else [((photos,), jnp.int32)]
     where = sharding.everywhere()
     cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import UserError
 from ..geometry.cameras import Cameras, to_host
 from ..geometry.interpolation import interpolate
-from ..sampling.inputs import MOST_FRAMES
+from ..sampling.inputs import FPS, MOST_FRAMES
 from ..scenes.paths import KeyFrames, read_keys, save_keys
 
 SECONDS = 1.0  # from one key frame to the next, where nobody says
@@ -61,9 +61,13 @@ def changed(
         )
     if seconds is not None and not LEAST <= seconds < 1e6:
         raise UserError(f"{seconds:g} s from one key frame to the next: give at least {LEAST:g}.")
-    given = {"c2w": c2w, "fov": fov, "seconds": seconds}
-    new = {name: value for name, value in given.items() if value is not None}
-    return (*keys[:number], dataclasses.replace(keys[number], **new), *keys[number + 1 :])
+    old = keys[number]
+    new = Key(
+        old.c2w if c2w is None else c2w,
+        old.fov if fov is None else fov,
+        old.seconds if seconds is None else seconds,
+    )
+    return (*keys[:number], new, *keys[number + 1 :])
 
 
 def times(keys: Keys) -> np.ndarray:
@@ -135,13 +139,11 @@ def read(
     height, width = size
     found = read_keys(file, height=height, width=width, context=context, scene=scene, **whose)
     if found.whole:
-        return thinned(found.cameras, height, found.fps or 16.0), found.fps
+        return thinned(found.cameras, height, found.fps or FPS), found.fps
+    k = len(found.cameras)
+    waits = np.full(k, SECONDS)
     if found.times is not None:
-        waits = np.diff(found.times, prepend=found.times[0])
-        return from_cameras(found.cameras, height, np.maximum(waits, LEAST)), found.fps
-    waits = None
-    if (
-        found.count and found.fps and len(found.cameras) > 1
-    ):  # evenly, in the time that the file says
-        waits = [(found.count - 1) / found.fps / (len(found.cameras) - 1)] * len(found.cameras)
+        waits = np.maximum(np.diff(found.times, prepend=found.times[0]), LEAST)
+    elif found.count and found.fps and k > 1:  # evenly, in the time that the file says
+        waits = np.full(k, (found.count - 1) / found.fps / (k - 1))
     return from_cameras(found.cameras, height, waits), found.fps

@@ -51,7 +51,7 @@ class Page:
         self.chosen: int | None = None  # key frame
         self.dragging = False  # it has handles
         self.flying: set[int] = set()
-        self.server = viser.ViserServer(host, port, label="roge_jax", verbose=False)
+        self.server: Any = viser.ViserServer(host, port, label="roge_jax", verbose=False)
         self.address = f"http://{host}:{self.server.get_port()}"
         self.server.gui.configure_theme(
             control_width="large", show_logo=False, show_share_button=False

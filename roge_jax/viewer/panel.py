@@ -22,7 +22,8 @@ class Panel:
     """The controls, and how they follow what they control."""
 
     def __init__(self, page: "Page"):
-        self.page, self.session, self.gui = page, page.session, page.server.gui
+        self.page, self.session = page, page.session
+        self.gui: Any = page.server.gui
         self.options: dict[str, Any] = {}
         self._view()
         self._path()
