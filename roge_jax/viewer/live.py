@@ -21,6 +21,7 @@ from ..scenes.scene import Scene
 from .desk import Desk
 from .levels import Level, Pace, levels, recon_size
 
+PATIENCE = 5.0  # seconds that an ended thread is waited for
 REST = 0.05  # seconds between two looks for something to do
 
 
@@ -149,12 +150,12 @@ class Worker:
             self.desk.leave(who)
 
     def stop(self) -> None:
-        """End the threads; a picture or a compilation that is under way is finished first."""
+        """End the threads; a picture that is under way is finished first, a compilation is not waited for."""
         with self.changed:
             self.stopped = True
             self.changed.notify_all()
         for thread in self.threads:
-            thread.join()
+            thread.join(PATIENCE)
 
     def _begin(self, target: Callable[..., None], *args: Any) -> None:
         thread = threading.Thread(target=target, args=args, daemon=True)

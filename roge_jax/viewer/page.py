@@ -86,6 +86,9 @@ class Page:
         pictures, _ = prepare(given.scene, given.photos.ids, height, width, drop_duplicates=False)
         small = (resize(p, THUMBNAIL, round(THUMBNAIL * width / height)) for p in pictures)
         self.thumbnails = [np.asarray(255 * picture, np.uint8) for picture in small]
+        if (points := session.points()) is not None:
+            size = 0.02 * self.length
+            server.scene.add_point_cloud("/points", *points, point_size=size)
         _, position = session.shown_at(cameras.c2w[0])
         first = server.initial_camera
         first.position = position

@@ -38,6 +38,8 @@ class Panel:
             fov = round(self.page._fov(0), 1)
             self.fov = self.gui.add_slider("Field of view", 5.0, 120.0, 0.5, fov)
             frusta = self.gui.add_checkbox("Cameras", True)
+            cloud = self.page.server.scene.get_handle_by_name("/points")
+            points = self.gui.add_checkbox("Points", True, visible=cloud is not None)
 
         @self.on(photo)
         def _(event):
@@ -49,6 +51,10 @@ class Panel:
         def _(event):
             event.client.camera.fov = float(np.radians(self.fov.value))
             self.page._looks(event.client)
+
+        @self.on(points)
+        def _(event):
+            cloud.visible = points.value
 
         @self.on(frusta)
         def _(event):

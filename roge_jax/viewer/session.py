@@ -1,6 +1,7 @@
 """All that the page shows and changes, without a page: the scene, its live picture, the path, the videos."""
 
 import dataclasses
+import json
 import re
 import tempfile
 import threading
@@ -25,6 +26,8 @@ from ..scenes.scene import Scene
 from ..video import solvers
 from . import keyframes, route, runs
 from .route import Route
+
+MOST_POINTS = 100_000  # that are shown
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,6 +85,16 @@ class Session:
         c2w[:3, :3] = rotation(np.roll(np.asarray(wxyz, np.float64), -1))
         c2w[:3, 3] = position
         return self.world.undo(Cameras(np.eye(3)[None], c2w[None])).c2w[0]
+
+    def points(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The sparse points of a scene that carries some: (xyz [p, 3] on the page, rgb [p, 3] uint8)."""
+        found = getattr(self.given.scene, "points", None)
+        if found is None or not len(found.xyz):
+            return None
+        kept = slice(None, None, 1 + len(found.xyz) // MOST_POINTS)
+        xyz = (found.xyz[kept] - self.world.origin[:3, 3]) @ self.world.origin[:3, :3]
+        rgb = np.full(xyz.shape, 128, np.uint8) if found.rgb is None else found.rgb[kept]
+        return xyz / self.world.divisor, rgb
 
     @property
     def up(self) -> np.ndarray:
@@ -155,7 +168,7 @@ class Session:
                 Path(folder)
                 / f"path{ending if re.fullmatch(r'[.][a-z0-9]{1,5}', ending) else '.json'}"
             )
-            file.write_bytes(content)
+            file.write_bytes(_of_cameras(content))
             context, source = self.given.photos.cameras, self.given.scene.source
             try:
                 found, fps = keyframes.read(file, self.size, context, source)
@@ -218,3 +231,20 @@ class Session:
 
     def _ended(self, run: runs.Run) -> None:
         self.tell("run")
+
+
+def _of_cameras(content: bytes) -> bytes:
+    """A path file without the names of files in it: what comes through the page must not make the program open them."""
+
+    def stripped(value: Any) -> Any:
+        if isinstance(value, list):
+            return [stripped(item) for item in value]
+        if not isinstance(value, dict):
+            return value
+        kept = {k: v for k, v in value.items() if not (k.endswith("path") and isinstance(v, str))}
+        return {k: stripped(v) for k, v in kept.items()}
+
+    try:
+        return json.dumps(stripped(json.loads(content))).encode()
+    except (ValueError, RecursionError):  # no JSON: other kinds of paths name no files
+        return content

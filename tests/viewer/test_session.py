@@ -1,8 +1,10 @@
 """Session, live picture and videos on the tiny model, without a page."""
 
+import dataclasses
 import json
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -72,6 +74,18 @@ def test_poses_go_to_the_page_and_back(ours):
     np.testing.assert_allclose(position, 0, atol=1e-12)
 
 
+def test_points_of_a_scene_lie_where_cameras_do(ours):
+    """On the page; a scene without points has none."""
+    assert ours.points() is None
+    centres = ours.given.photos.cameras.centres
+    cloud = SimpleNamespace(xyz=centres, rgb=None)
+    carried = dataclasses.replace(ours.given, scene=SimpleNamespace(points=cloud))
+    xyz, rgb = Session(carried).points()
+    shown = [ours.shown_at(pose)[1] for pose in ours.given.photos.cameras.c2w]
+    np.testing.assert_allclose(xyz, shown, atol=1e-12)
+    assert rgb.shape == xyz.shape and rgb.dtype == np.uint8
+
+
 def test_an_edit_that_gives_no_path_changes_nothing(ours):
     told = []
     ours.watch(told.append)
@@ -126,6 +140,23 @@ def test_a_file_that_is_no_path_says_so_by_its_own_name(ours):
     with pytest.raises(UserError):
         ours.load("../../x", b"\x00\x01")
     assert ours.route is before
+
+
+def test_an_opened_file_makes_nobody_open_others(ours, place, monkeypatch):
+    """A transforms.json names photos, here and anywhere; as a path it is cameras alone."""
+    from roge_jax.scenes import assemble, images, pictures
+
+    content = json.loads((place / "scene" / "transforms.json").read_text())
+    content["frames"][1]["file_path"] = "/etc/passwd"
+    content["frames"][2]["file_path"] = str(place / "scene" / "images" / "0002.png")
+    opened = []
+    for module in (assemble, images, pictures):
+        monkeypatch.setattr(module, "is_file", opened.append, raising=False)
+    monkeypatch.setattr("PIL.Image.open", opened.append)
+    ours.load("transforms.json", json.dumps(content).encode())
+    assert opened == [] and len(ours.route.keys) == 4
+    cameras = ours.given.photos.cameras
+    np.testing.assert_allclose([k.c2w for k in ours.route.keys], cameras.c2w, atol=1e-9)
 
 
 # ---- live picture --------------------------------------------------------------------------------
