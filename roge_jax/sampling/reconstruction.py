@@ -22,6 +22,7 @@ from ..core import sharding
 from ..core.params import Tree
 from ..geometry.cameras import Cameras, Normalisation, normalise, to_host
 from ..geometry.packing import pad_path
+from ..recon import depth
 from . import limits, programs
 from .photos import Photos
 from .video import Result, Stage, at_frames, check_photos
@@ -86,16 +87,17 @@ def known_shapes(params: Tree, views: model.Views, config: RoGeConfig) -> Known:
 def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
     full = views.get("full")
     tokens = model.reconstruct(params, views, config=config)
-    return Known(tokens, views if full is None else views | {"full": full.prepared()})
+    if full is None:
+        return Known(tokens, views)
+    match = params["renderer"]["lookup"].get("match")
+    return Known(tokens, views | {"full": depth.prepared(match, full)})
 
 
 def among(known: Known, kept: jax.Array) -> Known:
     """Some of the photos [k] of a scene: what is known of the others is not looked at."""
     views = {name: x[kept] for name, x in known.views.items() if name != "full"}
     if (full := known.views.get("full")) is not None:
-        rows = full.pyramid._replace(first=full.pyramid.first[:, kept])
-        parts = (x[kept] for x in full[:-1])
-        views["full"] = type(full)(*parts, pyramid=rows)
+        views["full"] = full.among(kept)
     return Known(known.tokens[kept], views)
 
 
