@@ -9,7 +9,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -218,15 +218,17 @@ def load_model(
     *,
     dtype: Any | Callable[[str], Any] = jnp.float32,
     shardings: Tree | None = None,
+    parts: Collection[str] | None = None,
 ) -> tuple[Tree, RoGeConfig]:
     """(params, config) of a model folder or shipped model, checked against the config before a value is read.
 
     Floating leaves come in `dtype`, which may be a function of the path; None: as they are stored. With `shardings`
     (a tree as of `core.sharding.shardings`) every device gets its share of a leaf straight from the file; without,
-    leaves are whole. Host memory beside the arrays themselves holds one leaf at a time. Raises: UserError if they
+    leaves are whole. `parts`: what of the tree's top level is wanted, all if None. Host memory beside the arrays themselves holds one leaf at a time. Raises: UserError if they
     are more than the memory has room for, before one is read.
     """
     tree, config = open_model(name)
+    tree = {part: x for part, x in tree.items() if parts is None or part in parts}
     wanted = dtype if callable(dtype) and not isinstance(dtype, type) else lambda path: dtype
     _check_memory(str(name), tree, wanted, shardings)
     return placed(tree, wanted, shardings), config

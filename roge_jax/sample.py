@@ -4,6 +4,8 @@
     python -m roge_jax.sample --scene DIR --trajectory spiral --frames 49 --seed 1
     python -m roge_jax.sample --scene DIR --context 0,7,12 --trajectory orbit:degrees=90,swing=false
     python -m roge_jax.sample --scene DIR --trajectory path.json
+    python -m roge_jax.sample --trajectory list                    every ready-made path with its options
+    python -m roge_jax.sample --scene DIR --preview-only           the reconstruction's own picture, nothing generated
     python -m roge_jax.sample --checkpoint paper --context 6 --dry-run     shapes, FLOPs, memory; no weights needed
 
 OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., transforms.json (the frames with
@@ -15,7 +17,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from .files.entry import Clock, environment, number, one_of, run
+from .files.entry import Clock, number, one_of, run
 from .files.folders import output_folder, write_json
 from .sampling.inputs import (
     ALONE,
@@ -59,8 +61,8 @@ def parser() -> argparse.ArgumentParser:
     option("--scene", "scene folder, motorcycle (two real photos) or procedural:SEED", SCENE)
     paths = ", ".join(sorted(PRESETS))
     path_help = (
-        f"a path file or a scene's own file or folder, or {paths}; options after a colon: orbit:degrees=90,swing=false "
-        f"(default: {THROUGH}; of a single photo {ALONE})"
+        f"a path file or a scene's own file or folder, or {paths}; options after a colon: orbit:degrees=90,swing=false; "
+        f"'list' prints all of them with their options (default: {THROUGH}; of a single photo {ALONE})"
     )
     option("--trajectory", path_help, metavar="NAME|FILE")
     frames_help = f"length of the path, up to {MOST_FRAMES}; the model's window, or the file's own"
@@ -82,6 +84,8 @@ def parser() -> argparse.ArgumentParser:
         "dataparser_transforms.json, or a 3x4 or 4x4 matrix by rows and a scale, with commas; found out if not given"
     )
     option("--path-frame", frame_help, metavar="WHERE")
+    preview_help = "the reconstruction's own picture alone: no generator runs or is loaded, video and frames are the preview"
+    p.add_argument("--preview-only", action="store_true", help=preview_help)
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
     option("--size", "HEIGHTxWIDTH of the pictures; the model's own if not given")
@@ -116,62 +120,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-# ---- outputs -------------------------------------------------------------------------------------
-
-
-def write_outputs(folder: Path, result, photos, fps: float) -> None:
-    """All files but run.json."""
-    from .files import video_io
-    from .scenes.paths import transforms
-
-    height, width = result.frames.shape[1:3]
-    names = video_io.write_frames(folder / "frames", result.frames)
-    write_json(folder / "transforms.json", transforms(names, result.cameras, height, width))
-    video_io.write_video(folder / "video.mp4", result.frames, fps)
-    video_io.write_video(folder / "preview.mp4", result.preview, fps)
-    rows = {
-        "photos": photos.images,
-        "generated": result.frames,
-        "preview (reconstruction)": result.preview,
-    }
-    video_io.write_png(folder / "contact_sheet.png", video_io.contact_sheet(rows))
-
-
-def record(
-    args: argparse.Namespace, config, settings, scene, photos, result, clock: Clock
-) -> dict[str, Any]:
-    """run.json: everything needed to know what was made and to make it again."""
-    from .config import to_dict
-
-    info = result.normalisation
-    return {
-        "program": "roge_jax.sample",
-        **environment(),
-        "arguments": vars(args),
-        "settings": dataclasses.asdict(settings),
-        "scene": {
-            "source": scene.source,
-            "photos": len(scene),
-            "context": list(photos.ids),
-            "context_names": [scene.names[i] for i in photos.ids],
-        },
-        "scale": {
-            "divisor": info.divisor,
-            "status": info.status,
-            "rule": info.rule,
-            "context_reach": info.context_reach,
-            "target_reach": info.target_reach,
-        },
-        "frames": len(result.frames),
-        "size": list(result.frames.shape[1:3]),
-        "evaluations": result.evaluations,
-        "windows": list(result.windows),
-        "warnings": [one._asdict() for one in result.warnings],
-        "stages": clock.record(),
-        "config": to_dict(config),
-    }
-
-
 # ---- the program ---------------------------------------------------------------------------------
 
 
@@ -182,8 +130,16 @@ def main(args: argparse.Namespace) -> None:
     from . import sampling
     from .core import sharding, target
     from .errors import UserError
+    from .sampling import reconstruction
+    from .sampling.outputs import record, write_outputs
     from .sampling.scene_limits import Beside
 
+    if args.trajectory == "list":
+        from .geometry.trajectories import describe
+
+        return print(describe())
+    if args.preview_only:
+        check_preview_only(args)
     settings = sampling.Settings(
         steps=args.steps or 0,
         solver=args.solver or "",
@@ -204,7 +160,9 @@ def main(args: argparse.Namespace) -> None:
     with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
-            params, _ = load_weights(args, mesh)
+            params, _ = load_weights(
+                args, mesh, reconstruction.PARTS if args.preview_only else None
+            )
         beside = Beside(scene, photos.ids, config, args.convention)
         print(
             f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.output_size[0]}x{config.output_size[1]}, {config.name}"
@@ -225,15 +183,28 @@ def main(args: argparse.Namespace) -> None:
                 )
             print(plan.explain())
         stage = beside.before_work(clock)
-        result = sampling.sample(
-            params, config, photos, path, settings, plan=plan, stage=stage, progress=True
-        )
+        given = params, config, photos, path
+        if args.preview_only:
+            result = sampling.preview(*given, scale=args.scale, stage=stage, progress=True)
+        else:
+            result = sampling.sample(*given, settings, plan=plan, stage=stage, progress=True)
         result = dataclasses.replace(result, warnings=(*result.warnings, *beside.tell()))
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
         with clock("write"):
-            write_outputs(folder, result, photos, args.fps)
-        content = record(args, config, settings, scene, photos, result, clock)
+            write_outputs(folder, result, photos, args.fps, generated=not args.preview_only)
+        used = {"scale": args.scale} if args.preview_only else dataclasses.asdict(settings)
+        content = record(
+            "roge_jax.sample",
+            vars(args),
+            config,
+            used,
+            scene,
+            photos,
+            result,
+            clock,
+            generated=not args.preview_only,
+        )
         content |= {} if plan is None else {"plan": dataclasses.asdict(plan)}
         write_json(folder / "run.json", content)
     stages = ", ".join(
@@ -242,15 +213,39 @@ def main(args: argparse.Namespace) -> None:
     print(
         f"{stages}; peak memory {content['stages']['total'].get('peak_memory_gb', float('nan')):.2f} GB"
     )
-    print(
-        f"wrote {args.out}/ (video.mp4, preview.mp4, frames, transforms.json, contact_sheet.png, run.json)"
+    videos = "video.mp4, the preview" if args.preview_only else "video.mp4, preview.mp4"
+    print(f"wrote {args.out}/ ({videos}, frames, transforms.json, contact_sheet.png, run.json)")
+
+
+def check_preview_only(args: argparse.Namespace) -> None:
+    """Raise UserError for options of the generator, which does not run."""
+    from .errors import UserError
+
+    unused = parser()
+    names = (
+        "steps",
+        "solver",
+        "schedule",
+        "seed",
+        "context_slots",
+        "long",
+        "tolerance",
+        "max_cost",
     )
+    for name in (*names, "compile"):
+        value = getattr(args, name)
+        if value != unused.get_default(name):
+            option = f"--{name.replace('_', '-')}" + (f" {value}" if value is not True else "")
+            raise UserError(
+                f"{option} is for the generator, and --preview-only runs none: leave one of the two away."
+            )
 
 
 def dry_run(args: argparse.Namespace, settings) -> str:
     """Shapes, tokens, FLOPs and memory as text, after the run's own checks of all but weights and OUT."""
     from . import cost
     from .core import aot, sharding, target
+    from .sampling import reconstruction
     from .sampling.windows import chained
     from .video import solvers
 
@@ -261,9 +256,10 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     settings, notes = settings.of(config), []
     dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
-        if target.fused(dtype):
+        if target.fused(dtype) and not args.preview_only:
             sharding.check_heads(config.dit.heads, mesh)
-        kept = cost.held_weights(config, mesh, dtype)
+        held = reconstruction.held_weights if args.preview_only else cost.held_weights
+        kept = held(config, mesh, dtype)
         notes.append(
             f"note: each device holds {cost.scaled(kept, 'B')} of weights; FLOPs and working memory are those of all "
             f"{mesh.size} devices together"
@@ -273,6 +269,9 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     if scene is not None:
         notes.append("note: for any scene with so many photos; none was read")
     m = len(photos.ids)
+    if args.preview_only:
+        text = reconstruction.report(config, m, frames=len(path), half=dtype == "bfloat16")
+        return "\n".join([text, *notes])
     if args.tolerance is not None or args.max_cost is not None:
         from .planning.plan import plan as make_plan
 

@@ -33,12 +33,13 @@ ALLOWED = {
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},
     "sampling": _PARTS | {"model", "cost", "checkpoint", "scenes", "procedural"},
+    "viewer": _PARTS | {"model", "checkpoint", "scenes", "sampling"},
     "planning": _PARTS | {"model", "cost", "scenes", "sampling"},
     "training": _PARTS
     | {"model", "preview", "weights", "procedural", "data", "metrics", "checkpoint", "cost"},
 }
 # Programs may import anything but other programs; a room's own program is its `__main__`.
-PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check"}
+PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check", "view"}
 LIGHT = {
     "jax",
     "ml_dtypes",

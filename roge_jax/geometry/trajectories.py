@@ -77,8 +77,7 @@ def make_path(
         raise UserError(f"A path of {frames} frames is empty: ask for 1 or more.")
     if not 0 <= start < len(context):
         raise UserError(f"start={start} is no context view: there are {len(context)}, from 0.")
-    preset = PRESETS[name]
-    defaults = {p.name: p.default for p in list(inspect.signature(preset).parameters.values())[2:]}
+    preset, defaults = PRESETS[name], preset_options(name)
     for option, value in options.items():
         if option not in defaults:
             hint = did_you_mean(option, [*defaults, "start", "focus", "ease"])
@@ -94,6 +93,30 @@ def make_path(
     s = s * s * (3.0 - 2.0 * s) if ease else s
     c2w, K = preset(rig, s, **options)
     return Cameras(K, c2w)
+
+
+def preset_options(name: str) -> dict[str, Any]:
+    """{option: its default} of a preset, beside the `start`, `focus` and `ease` that all of them have."""
+    every = list(inspect.signature(PRESETS[name]).parameters.values())
+    return {p.name: p.default for p in every[2:]}
+
+
+def describe() -> str:
+    """Every preset, what it does, and its options with their defaults: what `sample --trajectory list` prints."""
+    lines = []
+    for name, preset in PRESETS.items():
+        options = {k: "auto" if v is None else v for k, v in preset_options(name).items()}
+        words = ",".join(f"{k}={str(v).lower()}" for k, v in options.items())
+        what = " ".join((inspect.getdoc(preset) or "").split())
+        lines += [f"{name}:{words}", f"    {what}"]
+    return "\n".join(
+        [
+            *lines,
+            "",
+            "Written are the defaults. Lengths are in units of the distance in focus. All take start=PHOTO,",
+            "focus=DISTANCE (scene units; found out if not given) and ease=true (start and stop gently).",
+        ]
+    )
 
 
 def parse_options(text: str, where: str) -> dict[str, Any]:
@@ -224,24 +247,26 @@ def interpolated(rig: Rig, s: np.ndarray, order: str = "given") -> Poses:
     return path.c2w, path.K
 
 
-def _moving(direction: tuple[float, float, float], default: float = 0.3) -> Callable[..., Poses]:
+def _moving(
+    where: str, direction: tuple[float, float, float], default: float = 0.3
+) -> Callable[..., Poses]:
     def move(rig: Rig, s: np.ndarray, distance: float = default) -> Poses:
-        """Straight along a camera axis by `distance`, without turning."""
         poses = np.repeat(rig.start[None], len(s), 0)
         step = rig.start[:3, :3] @ np.array(direction) * distance * rig.focus
         poses[:, :3, 3] += s[:, None] * step[None]
         return poses, _still(rig, s)
 
+    move.__doc__ = f"Straight {where} by `distance`, without turning."
     return move
 
 
-def _rotating(axis: str, sign: float, default: float) -> Callable[..., Poses]:
+def _rotating(where: str, axis: str, sign: float, default: float) -> Callable[..., Poses]:
     def rotate(rig: Rig, s: np.ndarray, degrees: float = default) -> Poses:
-        """On the spot by `degrees`."""
         vector = {"up": rig.up, "right": rig.start[:3, 0], "ahead": rig.start[:3, 2]}[axis]
         angles = sign * np.radians(degrees) * s
         return _turned(rig, vector, angles, rig.start[:3, 3]), _still(rig, s)
 
+    rotate.__doc__ = f"On the spot, {where} by `degrees`."
     return rotate
 
 
@@ -267,7 +292,7 @@ def dolly_zoom_in(rig: Rig, s: np.ndarray, distance: float = 0.3) -> Poses:
     """Forward while zooming out, so that what is in focus keeps its size."""
     if distance >= 1:
         raise UserError(f"distance={distance} passes the point in focus: give less than 1.")
-    poses, _ = _moving((0.0, 0.0, 1.0))(rig, s, distance)
+    poses, _ = _moving(*FORWARD)(rig, s, distance)
     return poses, _zoomed(rig, 1.0 - distance * s)
 
 
@@ -276,27 +301,28 @@ def dolly_zoom_out(rig: Rig, s: np.ndarray, distance: float = 0.3) -> Poses:
     return dolly_zoom_in(rig, s, -distance)
 
 
+FORWARD, BACKWARD = ("forward", (0.0, 0.0, 1.0)), ("backward", (0.0, 0.0, -1.0))
 PRESETS: dict[str, Callable[..., Poses]] = {
-    "dolly-in": _moving((0.0, 0.0, 1.0)),
-    "dolly-out": _moving((0.0, 0.0, -1.0)),
+    "dolly-in": _moving(*FORWARD),
+    "dolly-out": _moving(*BACKWARD),
     "dolly-zoom-in": dolly_zoom_in,
     "dolly-zoom-out": dolly_zoom_out,
     "interpolate": interpolated,
     "lemniscate": lemniscate,
-    "move-backward": _moving((0.0, 0.0, -1.0)),
-    "move-down": _moving((0.0, 1.0, 0.0), 0.2),
-    "move-forward": _moving((0.0, 0.0, 1.0)),
-    "move-left": _moving((-1.0, 0.0, 0.0), 0.2),
-    "move-right": _moving((1.0, 0.0, 0.0), 0.2),
-    "move-up": _moving((0.0, -1.0, 0.0), 0.2),
+    "move-backward": _moving(*BACKWARD),
+    "move-down": _moving("down", (0.0, 1.0, 0.0), 0.2),
+    "move-forward": _moving(*FORWARD),
+    "move-left": _moving("to the left", (-1.0, 0.0, 0.0), 0.2),
+    "move-right": _moving("to the right", (1.0, 0.0, 0.0), 0.2),
+    "move-up": _moving("up", (0.0, -1.0, 0.0), 0.2),
     "orbit": orbit,
     "pan": pan,
-    "pan-left": _rotating("up", 1.0, 20.0),
-    "pan-right": _rotating("up", -1.0, 20.0),
-    "roll": _rotating("ahead", 1.0, 360.0),
+    "pan-left": _rotating("to the left", "up", 1.0, 20.0),
+    "pan-right": _rotating("to the right", "up", -1.0, 20.0),
+    "roll": _rotating("about the optical axis", "ahead", 1.0, 360.0),
     "spiral": spiral,
-    "tilt-down": _rotating("right", -1.0, 15.0),
-    "tilt-up": _rotating("right", 1.0, 15.0),
+    "tilt-down": _rotating("down", "right", -1.0, 15.0),
+    "tilt-up": _rotating("up", "right", 1.0, 15.0),
     "zoom-in": zoom_in,
     "zoom-out": zoom_out,
 }

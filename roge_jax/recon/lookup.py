@@ -47,6 +47,7 @@ from .sweep import (
     motion,
     pixels_of,
     shared_reach,
+    summed,
     twins,
     witnesses,
 )
@@ -309,10 +310,11 @@ def _fine(p: Tree, photos, alike, cuts: int, way: Motion, reach, cut, head):
     logits = jnp.moveaxis(conv2d(p["conv3"], y)[0], -1, 0) + UNSEEN * (n[..., 0] < 0.5)
     share = jax.nn.softmax(logits, 0)
     refined = cut + (share * offsets[:, None, None]).sum(0)
-    share = share.reshape(1, FINE, h * w, 1)
+    share = share.reshape(FINE, 1, h * w, 1)
     m = len(photos)
-    found = (share * values).sum(1).reshape(m, h, w, 3)
-    return found, (share * seen[..., None]).sum(1).reshape(m, h, w, 1), refined
+    found = summed(share * jnp.swapaxes(values, 0, 1)).reshape(m, h, w, 3)
+    seen = summed(share * jnp.swapaxes(seen[..., None], 0, 1)).reshape(m, h, w, 1)
+    return found, seen, refined
 
 
 def _upsampled(weights, x) -> jax.Array:
@@ -342,7 +344,7 @@ def _chosen(p: Tree, found, seen, alike, far, head):
     The choice starts from 1 / distance^2 among photos that see the cut.
     """
     weight = witnesses(seen, alike)
-    mean = (found * weight).sum(0) / jnp.maximum(weight.sum(0), EPS)
+    mean = summed(found * weight) / jnp.maximum(summed(weight), EPS)
     nearest = far.min(0, keepdims=True)
     change = found - mean[None]
     odd = jnp.abs(change).mean(-1, keepdims=True)
@@ -352,10 +354,10 @@ def _chosen(p: Tree, found, seen, alike, far, head):
     y = conv2d(p["conv2"], y)
     near = -2.0 * jnp.log(far / (nearest + 1e-3) + 1e-2)
     share = jax.nn.softmax(y + jnp.log(witnesses(seen + 1e-4, alike)) + near, 0)
-    looked = (share * found).sum(0)
-    spread = (share * jnp.square(found - looked[None])).sum(0).mean(-1, keepdims=True)
-    about = jnp.concatenate([jnp.sqrt(spread + 1e-6), (share * far).sum(0)], -1)
-    return looked, (share * seen).sum(0), about, share
+    looked = summed(share * found)
+    spread = summed(share * jnp.square(found - looked[None])).mean(-1, keepdims=True)
+    about = jnp.concatenate([jnp.sqrt(spread + 1e-6), summed(share * far)], -1)
+    return looked, summed(share * seen), about, share
 
 
 def _merged(p: Tree, head, looked, some, about) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from .aggregate import TOGETHER, enlarged
-from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, texels
+from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, summed, texels
 
 Array = Any  # of JAX, or of NumPy before a program takes it
 LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
@@ -27,6 +27,11 @@ class Photos(NamedTuple):
     size: Array  # [m, 2] height and width of each in pixels of `rgb`
     scale: Array  # [m, 2] pixels of `rgb` in one of the model's, down and across
     offset: Array  # [m, 2] where the window begins in `rgb`
+    pyramid: "Pyramid | None" = None  # of `rgb`, where it was made before (`prepared`)
+
+    def prepared(self) -> "Photos":
+        """With their pyramid, for those who look again and again."""
+        return self._replace(pyramid=Pyramid.of(self.rgb))
 
     def shrunk(self, times: int = 1) -> "Photos":
         """The coarse ones in place of `rgb`; `times` as fine, of `rgb`."""
@@ -119,7 +124,7 @@ def render(
       blend: at the model's size h x w, with leading axis v.
       scale: [v, m] focal length of the photo over that of the view, in pixels of the model's size.
     """
-    pyramid = Pyramid.of(photos.rgb)
+    pyramid = Pyramid.of(photos.rgb) if photos.pyramid is None else photos.pyramid
 
     def one(view):
         return _render(pyramid, photos, *view, height, width)
@@ -142,12 +147,12 @@ def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, h
     colours, seen = colours.reshape(m, height, width, 3), seen.reshape(m, height, width, 1)
 
     share = _resized(blend.share, height, width) * seen
-    weight = share.sum(0)
-    photos = (share * colours).sum(0) / jnp.maximum(weight, EPS)  # [height, width, 3]
+    weight = summed(share)
+    photos = summed(share * colours) / jnp.maximum(weight, EPS)  # [height, width, 3]
     head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
     mixed = head + rest + gate * (photos - head)
     # The mixture is cautious. Where the photos agree with one another they are taken as they are.
-    apart = (share * jnp.abs(colours - photos[None])).sum(0)
+    apart = summed(share * jnp.abs(colours - photos[None]))
     apart = (apart[..., :1] + apart[..., 1:2] + apart[..., 2:]) / 3.0
     apart = _resized(_resized(apart / jnp.maximum(weight, EPS), h, w), height, width)
     trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * jnp.clip(weight / FADE, 0.0, 1.0)

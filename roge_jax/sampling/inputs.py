@@ -172,21 +172,24 @@ def sampling_mesh(args: argparse.Namespace):
     return sharding.make_mesh(**{"data": 1} | sizes, devices=devices)
 
 
-def load_weights(args: argparse.Namespace, mesh=None):
-    """(params, config of the file). Large models are bfloat16 on accelerators, apart from what must not be."""
+def load_weights(args: argparse.Namespace, mesh=None, parts=None):
+    """(params, config of the file), of the `parts` of the tree that are wanted. Large models are bfloat16 on accelerators,
+    apart from what must not be.
+    """
     from .. import checkpoint, cost, model
     from ..core import sharding, target
     from ..core.params import count
 
     config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
     specs = model.specs(config)
-    if target.platform() == "gpu":
+    if target.platform() == "gpu" and parts is None:
         sharding.check_heads(config.dit.heads, mesh)
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(
         args.checkpoint,
         dtype=cost.kept_as(dtype),
         shardings=None if mesh is None else sharding.shardings(specs, mesh),
+        parts=parts,
     )
 
 

@@ -16,7 +16,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +49,18 @@ LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
 Stage = Callable[[str], AbstractContextManager]
+
+
+class Bar(Protocol):
+    """What is told how far a video is: tqdm's bars are such."""
+
+    def reset(self, total: float | None = None) -> Any: ...
+
+    def update(self, n: float = 1) -> Any: ...
+
+    def set_description(self, desc: str) -> Any: ...
+
+    def close(self) -> Any: ...
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,7 +116,8 @@ class Result:
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
 
 
-def _check_photos(photos: Photos, config: RoGeConfig) -> None:
+def check_photos(photos: Photos, config: RoGeConfig) -> None:
+    """Raise UserError for photos of another size than the model's."""
     wanted = (len(photos.ids), config.height, config.width, 3)
     if np.shape(photos.images) != wanted or len(photos.cameras) != wanted[0]:
         raise UserError(
@@ -160,7 +173,7 @@ def sample(
     *,
     stage: Stage | None = None,
     plan: Planned | None = None,
-    progress: bool = False,
+    progress: bool | Bar = False,
     cache: dict[Any, Any] | None = None,
 ) -> Result:
     """The video along `path` (cameras [n] in the scene's frame, K in pixels of config.height x config.width).
@@ -168,14 +181,14 @@ def sample(
     Args:
       stage: called with "compile", "prepare", "sample" and "decode"; a context manager that times (`entry.Clock`).
       plan: what to leave out (`planning.plan`); its steps, solver and schedule replace those of `settings`.
-      progress: show a bar over all evaluations of the velocity.
+      progress: show a bar over all evaluations of the velocity, or the bar to tell them to.
       cache: a dict that keeps the compiled programs for further calls with these parameters, config and slots.
     Raises: UserError for what cannot be done; `solvers.SamplingError` at the first number that is not finite.
     """
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
-    _check_photos(photos, config)
+    check_photos(photos, config)
     if plan is not None:
         if tuple(plan.ids) != tuple(photos.ids):
             raise UserError(
@@ -273,7 +286,7 @@ def sample(
     return Result(
         np.concatenate(frames),
         np.concatenate(previews),
-        _at_frames(to_host(path), config),
+        at_frames(to_host(path), config),
         info,
         evaluations,
         tuple(told),
@@ -304,7 +317,7 @@ def at_output(
     return np.clip(full + change, 0.0, 1.0)
 
 
-def _at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
+def at_frames(path: Cameras, config: RoGeConfig) -> Cameras:
     """Cameras with K in pixels of the frames instead of the model's."""
     return Cameras(scale_K(path.K, (config.height, config.width), config.output_size), path.c2w)
 
@@ -385,9 +398,12 @@ def _enlarged(images: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.asarray(model.resized(jnp.asarray(images), height, width))
 
 
-def _bar(progress: bool, settings: Settings, grid: np.ndarray, runs: int):
+def _bar(progress: bool | Bar, settings: Settings, grid: np.ndarray, runs: int) -> Bar:
     from tqdm import tqdm
 
     fixed = solvers.SOLVERS[settings.solver].method is not None
     total = runs * len(solvers.tabulate(settings.solver, grid).sigma) if fixed else None
+    if not isinstance(progress, bool):
+        progress.reset(total)
+        return progress
     return tqdm(total=total, desc="sampling", unit="step", disable=not progress, dynamic_ncols=True)

@@ -29,7 +29,17 @@ from roge_jax.scenes.frames import Frame, Reading
 from roge_jax.scenes.readers import read_place
 from roge_jax.scenes.writers import transforms
 
-__all__ = ["LoadedPath", "interpolate", "load_path", "read_path", "save_path", "transforms"]
+__all__ = [
+    "KeyFrames",
+    "LoadedPath",
+    "interpolate",
+    "load_path",
+    "read_keys",
+    "read_path",
+    "save_keys",
+    "save_path",
+    "transforms",
+]
 
 MOST = 1_000_000  # frames that keyframes are interpolated to: more are a slip of the pen
 KEY_FRAMES = 81  # of key frames that do not say how many frames they make
@@ -139,18 +149,7 @@ def read_path(
     if frames is not None:
         frames = number(frames, str(file), "frames", low=1, whole=True)
     target = (height, width) if height and width else None
-    reading = read_place(file, convention=convention, photos=False, target=target)
-    if not reading.frames:
-        raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
-    posed = _posed(reading, file)
-    K, sizes = _intrinsics(reading, posed, target, context, file)
-    poses = np.stack([one.c2w for one in posed])
-    place = Path(scene) if scene is not None and Path(scene).exists() else None
-    first = None if context is None else to_host(context).c2w[0]
-    poses = world.to_scene(poses, frame, reading.frame, file, place, first)
-    names = [f"{file.name} frame {i}" for i in range(len(poses))]
-    heights, widths = zip(*sizes, strict=True)
-    cameras = validate(Cameras(np.stack(K), poses), heights, widths, names, read_as=reading.axes)
+    cameras, reading = _as_written(file, target, context, convention, frame, scene)
     notes = tuple(note for note in reading.notes if reading.keys or _concerns_a_path(note))
     if reading.keys:
         count = frames or reading.count or KEY_FRAMES
@@ -164,6 +163,75 @@ def read_path(
             f"{len(cameras)}, or write 'keyframes' to have them interpolated."
         )
     return LoadedPath(cameras, reading.fps, reading.axes, notes)
+
+
+@dataclasses.dataclass(frozen=True)
+class KeyFrames:
+    """Key cameras [k] of a path as a file has them, not interpolated; `times` [k] in seconds, None for constant speed.
+
+    `whole`: the file has frames and no key frames; these are all of them.
+    """
+
+    cameras: Cameras
+    times: np.ndarray | None = None
+    count: int | None = None
+    fps: float | None = None
+    whole: bool = False
+
+
+def read_keys(
+    file: str | Path,
+    *,
+    height: int,
+    width: int,
+    context: Cameras,
+    convention: str | None = None,
+    frame: world.Frame = None,
+    scene: str | Path | None = None,
+) -> KeyFrames:
+    """The key frames of a path file, for editing; arguments as of `load_path`."""
+    file = Path(file)
+    cameras, reading = _as_written(file, (height, width), context, convention, frame, scene)
+    return KeyFrames(cameras, reading.times, reading.count, reading.fps, not reading.keys)
+
+
+def save_keys(file: str | Path, keys: KeyFrames, height: int, width: int) -> None:
+    """Writes key cameras of height x width pictures as a path file of our own, which `load_path` interpolates."""
+    cameras = to_host(keys.cameras)
+    entries = [
+        {"pose": pose.tolist(), "K": K.tolist()}
+        for pose, K in zip(cameras.c2w, cameras.K, strict=True)
+    ]
+    if keys.times is not None:
+        entries = [entry | {"time": float(t)} for entry, t in zip(entries, keys.times, strict=True)]
+    content: dict[str, Any] = {"convention": "opencv", "width": width, "height": height}
+    content |= {k: v for k, v in (("fps", keys.fps), ("count", keys.count)) if v is not None}
+    Path(file).write_text(json.dumps(content | {"keyframes": entries}, indent=1))
+
+
+def _as_written(
+    file: Path,
+    target: tuple[int, int] | None,
+    context: Cameras | None,
+    convention: str | None,
+    frame: world.Frame,
+    scene: str | Path | None,
+) -> tuple[Cameras, Reading]:
+    """The cameras that a path file lists, frames or key frames, in the scene's coordinates."""
+    reading = read_place(file, convention=convention, photos=False, target=target)
+    if not reading.frames:
+        raise UserError(f"{file}: has no cameras: give a list 'frames' or 'keyframes'.")
+    posed = _posed(reading, file)
+    K, sizes = _intrinsics(reading, posed, target, context, file)
+    poses = np.stack([one.c2w for one in posed])
+    place = Path(scene) if scene is not None and Path(scene).exists() else None
+    first = None if context is None else to_host(context).c2w[0]
+    poses = world.to_scene(poses, frame, reading.frame, file, place, first)
+    names = [f"{file.name} frame {i}" for i in range(len(poses))]
+    heights, widths = zip(*sizes, strict=True)
+    return validate(
+        Cameras(np.stack(K), poses), heights, widths, names, read_as=reading.axes
+    ), reading
 
 
 def _concerns_a_path(note: Finding) -> bool:

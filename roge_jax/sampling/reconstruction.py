@@ -1,0 +1,197 @@
+"""The reconstruction alone: a scene is encoded once and asked for its own picture from any camera. Nothing is generated.
+
+    known, info = encode(params, config, photos, path)
+    pictures = jax.jit(functools.partial(look, config=config))(params, known, *normalised cameras)
+
+Of the parameters it reads those of `PARTS` alone: the generator need not be loaded. `preview` is `sampling.sample` without
+a generator; `roge_jax.viewer` asks for one camera at a time.
+"""
+
+import functools
+from collections.abc import Callable
+from contextlib import nullcontext
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .. import cost, model
+from ..config import RoGeConfig
+from ..core import sharding
+from ..core.params import Tree
+from ..geometry.cameras import Cameras, Normalisation, normalise, to_host
+from ..geometry.packing import pad_path
+from . import limits, programs
+from .photos import Photos
+from .video import Result, Stage, at_frames, check_photos
+from .windows import window_views, windows
+
+PARTS = ("encoder", "renderer")  # of the parameter tree
+STAGES = ("reconstruct", "query rays", "look into photos")  # of `cost.estimate`
+
+
+class Known(NamedTuple):
+    """A scene once it is encoded: all that a picture of it needs, on the devices."""
+
+    tokens: jax.Array  # [m, l, d]
+    views: model.Views  # of the photos alone, without targets
+
+
+def encode(
+    params: Tree,
+    config: RoGeConfig,
+    photos: Photos,
+    near: Cameras,
+    *,
+    scale: float | None = None,
+    stage: Stage | None = None,
+) -> tuple[Known, Normalisation]:
+    """Photos to scene tokens; `Normalisation.apply` brings cameras into their frame.
+
+    near: cameras about where pictures will be asked for, K in pixels of config.height x config.width. They decide the
+      scale only where the photos do not, as of a single one. scale: a divisor of all positions instead.
+    """
+    stage = stage or (lambda name: nullcontext())
+    check_photos(photos, config)
+    context, targets, info = normalise(photos.cameras, near, rule=config.scale_rule, scale=scale)
+    seen = photos.images, photos.recon, context
+    views = window_views(*seen, targets[:1], info, config, frames=1, full=photos.full)
+    views |= {"K": views["K"][:-1], "c2w": views["c2w"][:-1]}
+    views = jax.device_put(views, sharding.everywhere())
+    with stage("compile"):
+        program = jax.jit(functools.partial(_known, config=config))
+        run = program.lower(*sharding.shapes((params, views))).compile()
+    with stage("prepare"):
+        return jax.block_until_ready(run(params, views)), info
+
+
+def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
+    full = views.get("full")
+    tokens = model.reconstruct(params, views, config=config)
+    return Known(tokens, views if full is None else views | {"full": full.prepared()})
+
+
+def among(known: Known, kept: jax.Array) -> Known:
+    """Some of the photos [k] of a scene: what is known of the others is not looked at."""
+    views = {name: x[kept] for name, x in known.views.items() if name != "full"}
+    if (full := known.views.get("full")) is not None:
+        rows = full.pyramid._replace(first=full.pyramid.first[:, kept])
+        parts = (x[kept] for x in full[:-1])
+        views["full"] = type(full)(*parts, pyramid=rows)
+    return Known(known.tokens[kept], views)
+
+
+def look(
+    params: Tree,
+    known: Known,
+    K: jax.Array,
+    c2w: jax.Array,
+    kept: jax.Array | None = None,
+    *,
+    config: RoGeConfig,
+) -> jax.Array:
+    """The picture [n, H, W, 3] at the output's size of cameras K [n, 3, 3] in pixels of config.height x config.width, c2w
+    [n, 4, 4] normalised. `kept`: of some of the photos alone (`among`)."""
+    known = known if kept is None else among(known, kept)
+    views = {name: jnp.concatenate([known.views[name], x]) for name, x in (("K", K), ("c2w", c2w))}
+    shown, full = programs.rgb_head(
+        params, known.views | views, config=config, scene_tokens=known.tokens
+    )
+    return model.resized(shown, *config.output_size) if full is None else full
+
+
+def compiled(
+    params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None = None
+) -> Callable:
+    """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
+    shapes = [((count, n, n), jnp.float32) for n in (3, 4)]
+    shapes += [] if photos is None else [((photos,), jnp.int32)]
+    where = sharding.everywhere()
+    cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)
+    program = jax.jit(functools.partial(look, config=config), out_shardings=sharding.everywhere())
+    return program.lower(*sharding.shapes((params, known)), *cameras).compile()
+
+
+def preview(
+    params: Tree,
+    config: RoGeConfig,
+    photos: Photos,
+    path: Cameras,
+    *,
+    scale: float | None = None,
+    stage: Stage | None = None,
+    progress: bool = False,
+) -> Result:
+    """The reconstruction's picture along `path`, as `frames` and `preview` of a result without evaluations.
+
+    As `sampling.sample`, whose windows all see the photos alone here. `scale`: as of `encode`.
+    """
+    from tqdm import tqdm
+
+    stage = stage or (lambda name: nullcontext())
+    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
+    known, info = encode(params, config, photos, path, scale=scale, stage=stage)
+    targets = info.apply(path)
+    runs = windows(len(path), min(config.frames, len(path)))
+    length = runs[0][1]
+    with stage("compile"):
+        run = compiled(params, known, length, config)
+    frames = []
+    for start, stop in tqdm(runs, desc="preview", disable=not progress, dynamic_ncols=True):
+        some = pad_path(targets[start:stop], length)
+        K, c2w = (np.asarray(x, np.float32) for x in (some.K, some.c2w))
+        with stage("preview"):
+            frames.append(np.array(run(params, known, K, c2w))[: stop - start])
+    made = np.concatenate(frames)
+    whole, used = [0, len(path) - 1], list(photos.ids)
+    told = {"frames": whole, "photos": used, "generated": [], "rgb_head": [whole]}
+    return Result(made, made, at_frames(to_host(path), config), info, 0, (told,), warned)
+
+
+def held_weights(config: RoGeConfig, mesh: sharding.AnyMesh, dtype: str) -> int:
+    """`cost.held_weights` of the reconstruction alone."""
+    specs = model.specs(config)
+    return sharding.held({part: specs[part] for part in PARTS}, mesh, cost.kept_as(dtype))
+
+
+def report(config: RoGeConfig, m: int, *, frames: int, half: bool) -> str:
+    """What `--preview-only --dry-run` prints: the parts of `cost.report` that run."""
+    dtype = jnp.bfloat16 if half else jnp.float32
+    whole, size = (
+        cost.estimate(config, m, 0, dtype=dtype),
+        (config.recon_height, config.recon_width),
+    )
+    rays = frames + (m if config.renderer.refinement == "shared" else 0)
+    flops = {
+        "reconstruct": cost.encoder(config.encoder, *size, m, config.renderer.width),
+        "query rays": cost.renderer(
+            config.renderer, *size, cost.scene_tokens_read(config, m), m, rays
+        ),
+        "look into photos": cost.lookup(config.renderer, *size, m, frames),
+    }
+    working = {name: whole.working_bytes[name] for name in STAGES if name in whole.working_bytes}
+    weights, output = sum(whole.weights[part] for part in PARTS), config.output_size
+    count = sum(cost.weight_bytes(config)[part] for part in PARTS) / 4e6
+    peak = weights + max(working.values())
+    if config.renderer.lookup and output != size:
+        peak += cost.rendering.working_bytes(m, *output, config.frames + 2 * frames)
+    lines = [
+        f"model     {config.name}, its reconstruction alone: {count:,.1f} M parameters, {weights / 1e9:,.2f} GB in "
+        f"{'bfloat16' if half else 'float32'}",
+        f"preview   {frames} frames of {output[0]}x{output[1]} (reconstruction at {size[0]}x{size[1]}); nothing is "
+        "generated",
+        f"photos    {m}, {whole.tokens['scene tokens']:,} scene tokens",
+        "",
+        f"{'stage':24s}{'FLOPs':>16s}{'working memory':>18s}",
+    ]
+    for name in working:
+        work, flop = cost.scaled(working[name], "B"), cost.scaled(flops[name], "FLOP")
+        lines.append(f"{name:24s}{flop:>16s}{work:>18s}")
+    total = cost.scaled(sum(flops[name] for name in working), "FLOP")
+    lines += [f"{'all frames':24s}{total:>16s}", ""]
+    lines.append(
+        f"peak memory about {cost.scaled(peak, 'B')}: weights and the hungriest stage, beside the runtime's own 0.3 to "
+        "0.6 GB"
+    )
+    return "\n".join(lines)
