@@ -78,8 +78,12 @@ def _level(photos, side: int, cuts, match, way, photo_depth, inverse, alike, key
     _, h, w, _ = photos.shape
     k = len(cuts)
     row, column = jax.random.split(key)
-    top = jax.random.randint(row, (PATCHES, 1, 1), 0, h - SIDE + 1) + jnp.arange(SIDE)[None, :, None]
-    left = jax.random.randint(column, (PATCHES, 1, 1), 0, w - SIDE + 1) + jnp.arange(SIDE)[None, None]
+    top = (
+        jax.random.randint(row, (PATCHES, 1, 1), 0, h - SIDE + 1) + jnp.arange(SIDE)[None, :, None]
+    )
+    left = (
+        jax.random.randint(column, (PATCHES, 1, 1), 0, w - SIDE + 1) + jnp.arange(SIDE)[None, None]
+    )
     y, x = (z.reshape(-1) for z in jnp.broadcast_arrays(top, left))
     true = inverse[side * y + side // 2, side * x + side // 2]
     where = jnp.stack([x + 0.5, y + 0.5], -1)

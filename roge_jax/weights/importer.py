@@ -31,6 +31,7 @@ from .sources import DTYPES, Source
 READABLE = {DTYPES[name] for name in ("F64", "F32", "F16", "BF16")}
 HALF = DTYPES["BF16"]
 PLAN, PROGRESS = "plan.json", "progress"
+LISTED = 20  # kinds of mismatches of a file that an error names
 FLUSH_BYTES = 1_000_000_000  # written between two notes of the progress
 
 
@@ -160,11 +161,16 @@ def report(faults: Iterable[Fault]) -> None:
     files: dict[str, list[str]] = {}
     for (file, pattern, what), numbers in groups.items():
         files.setdefault(file, []).append(f"{pattern.replace('{}', _ranges(numbers))} {what}")
-    listed = " | ".join(f"{file}: {'; '.join(lines)}" for file, lines in files.items())
+    listed = " | ".join(f"{file}: {_shortened(lines)}" for file, lines in files.items())
     count = "1 tensor does" if len(faults) == 1 else f"{len(faults)} tensors do"
     raise UserError(
         f"{count} not fit this model. {listed}. Check that the files are whole and belong to this model (--preset)."
     )
+
+
+def _shortened(lines: list[str]) -> str:
+    more = f"; and {len(lines) - LISTED} kinds more" if len(lines) > LISTED else ""
+    return "; ".join(lines[:LISTED]) + more
 
 
 def _ranges(numbers: list[int]) -> str:

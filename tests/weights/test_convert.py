@@ -582,16 +582,58 @@ def test_wrong_family(files, tmp_path):
 
 def test_missing_parts(files, tmp_path):
     wan = files["wan"]
-    fails("Nothing fills encoder, renderer: give --lagernvs", "--wan", wan)
+    half = ["--wan", wan, "--random", "encoder"]
+    fails("Nothing fills renderer: give --lagernvs", *half)
     fails(
         "--random dit, but a file fills it", "--wan", wan, "--random", "dit", "encoder", "renderer"
     )
     fails("--framecrafter holds changes", "--framecrafter", wan)
     fails("does not exist", "--wan", tmp_path / "nowhere.safetensors")
     (tmp_path / "empty").mkdir()
-    fails("holds no safetensors", "--wan", tmp_path / "empty")
+    fails(r"empty holds no weights \(it is empty\): give the folder", "--wan", tmp_path / "empty")
     with pytest.raises(UserError, match="No --out given"):
         run("--wan", wan)
+
+
+POINTER = (
+    "version https://git-lfs.github.com/spec/v1\n"
+    "oid sha256:38071ab59bd94681c686fa51d75a1968f64e470262043be31f7a094e442fd981\nsize 507609880\n"
+)
+
+
+def test_downloads_that_are_not_whole(files, tmp_path):
+    """What lies there in place of weights is named, with the command that gets them."""
+    for name in ("diffusion_pytorch_model.safetensors", "model.pt"):
+        option = "--lagernvs" if name == "model.pt" else "--wan"
+        file = tmp_path / "pointers" / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(POINTER)
+        fails(rf"{name} is a Git LFS pointer and not the weights .*`git lfs pull`", option, file)
+        file.write_text("<!DOCTYPE html>\n<html><body>Log in</body></html>" + " " * 100)
+        fails(rf"{name} is a web page and no weights, .*`hf auth login`", option, file)
+    folder = tmp_path / "Wan2.1-T2V-1.3B"
+    folder.mkdir()
+    (folder / "config.json").write_text("{}")
+    command = "hf download Wan-AI/Wan2.1-T2V-1.3B --include config.json "
+    fails(rf"holds no weights \(only config.json\): download it with `{command}", "--wan", folder)
+    unfinished = folder / ".cache/huggingface/download/abc.incomplete"
+    unfinished.parent.mkdir(parents=True)
+    unfinished.write_bytes(b"12")
+    fails(f"download was not finished: `{command}.*` goes on with it", "--wan", folder)
+    made.save_torch(folder / "Wan2.1_VAE.pth", {"a": (2,)}, lambda *_: np.zeros(2))
+    fails(
+        f"has Wan2.1_VAE.pth, but no transformer .*: download it with `{command}", "--wan", folder
+    )
+    lager = tmp_path / "lagernvs_general_512"
+    lager.mkdir()
+    (lager / "README.md").write_text("a card")
+    said = "holds no weights .only README.md.: ask for access on https://huggingface.co/facebook/lagernvs_general_512"
+    fails(said, "--lagernvs", lager)
+    snapshot = tmp_path / "models--facebook--VGGT-1B/snapshots/12"
+    snapshot.mkdir(parents=True)
+    (tmp_path / "models--facebook--VGGT-1B/blobs").mkdir()
+    (tmp_path / "models--facebook--VGGT-1B/blobs/34.incomplete").write_bytes(b"12")
+    fails("download was not finished: `hf download facebook/VGGT-1B", "--vggt", snapshot)
 
 
 def test_missing_shard_and_truncated_file(files, tmp_path):
