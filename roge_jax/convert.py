@@ -65,9 +65,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--t5",
         type=Path,
-        help="umT5 encoder and tokenizer (Hugging Face folder) to compute them with",
+        help="umT5 encoder to compute them with: models_t5_umt5-xxl-enc-bf16.pth, or a Hugging Face folder with its\n"
+        "tokenizer (default: what lies beside --wan)",
     )
-    p.add_argument("--prompt", default="", help="the prompt for --t5 (default: the empty prompt)")
+    p.add_argument(
+        "--prompt",
+        default="",
+        help="the prompt for --t5 (default: the empty prompt); any other needs the extra 'convert'",
+    )
     p.add_argument(
         "--random",
         nargs="+",
@@ -147,14 +152,12 @@ def main(args: argparse.Namespace) -> None:
 
 
 def make_plan(args: argparse.Namespace):
-    """(plan, what each file does), from headers alone but for the prompt. Raises: UserError with all mismatches."""
-    import numpy as np
-
+    """(plan, what each file does), from headers alone. Raises: UserError with all mismatches."""
     from .core.params import flatten
     from .errors import UserError
     from .model import specs
-    from .weights import catalogue, importer, published
-    from .weights.prompt import check_encoder, encode_prompt, read_prompt
+    from .weights import catalogue, importer, published, umt5
+    from .weights.prompt import choose_rows
     from .weights.sources import open_source
 
     filled: list[Any] = []
@@ -171,8 +174,6 @@ def make_plan(args: argparse.Namespace):
         )
     if args.t5 and args.prompt_embedding:
         raise UserError("--t5 and --prompt-embedding both give the prompt: leave one of them away.")
-    if args.t5:
-        check_encoder(args.t5)
     if args.wan:
         wan, vae_path = published.find_wan(args.wan)
     if args.lagernvs or args.vggt:
@@ -202,21 +203,16 @@ def make_plan(args: argparse.Namespace):
     importer.report(fault for part in filled for fault in part.faults)
 
     given: dict[str, Any] = {}
-    if parts == "reconstruction":
-        if args.prompt_embedding or args.t5:
-            raise UserError(
-                "A reconstruction alone reads no text: leave --prompt-embedding and --t5 away."
-            )
-    elif config.dit.text_len and args.prompt_embedding:
-        given["prompt/rows"] = read_prompt(args.prompt_embedding, config.dit)
-    elif config.dit.text_len and args.t5 and args.dry_run:  # in place of what umT5 will say
-        given["prompt/rows"] = np.zeros((config.dit.text_len, config.dit.text_dim), np.float32)
-    elif config.dit.text_len and args.t5:
-        given["prompt/rows"] = encode_prompt(args.t5, args.prompt, config.dit)
-    elif args.prompt_embedding or (args.t5 and not config.dit.text_len):
-        raise UserError(
-            f"Preset '{config.name}' reads no text: leave --prompt-embedding and --t5 away."
-        )
+    wanted = parts != "reconstruction" and config.dit.text_len > 0
+    if not wanted and (args.prompt_embedding or args.t5):
+        which = "A reconstruction alone" if parts == "reconstruction" else f"Preset '{config.name}'"
+        raise UserError(f"{which} reads no text: leave --prompt-embedding and --t5 away.")
+    said = "none"
+    if wanted:
+        beside = umt5.find(catalogue.locate(args.wan)) if args.wan else None
+        how = {"embedding": args.prompt_embedding, "encoder": args.t5, "beside": beside}
+        said, rows = choose_rows(config.dit, args.prompt, **how)
+        given = {} if rows is None else {"prompt/rows": rows}
     fills = [fill for part in filled for fill in part.fills]
     tree = flatten(specs(config))
     importer.check_coverage(fills, tree)
@@ -232,7 +228,7 @@ def make_plan(args: argparse.Namespace):
             }
             for part in filled
         ],
-        "prompt": "none" if parts == "reconstruction" else _prompt_note(args),
+        "prompt": said,
         "initialised": plan.initialised,
         "seed": args.seed,
     }
@@ -356,15 +352,10 @@ def _parts(args, have: dict[str, Any]) -> Parts:
     return "all" if len(halves) == 2 else "reconstruction" if halves == {True} else "generator"
 
 
-def _prompt_note(args) -> str:
-    if args.prompt_embedding:
-        return f"read from {args.prompt_embedding.name}"
-    return f"umT5 of '{args.prompt}'" if args.t5 else "none: all rows are zero"
-
-
 def summary(plan, filled, layout) -> str:
     """What fills what, as text for people."""
     from .core.params import count
+    from .weights import umt5
 
     lines = []
     for part in filled:
@@ -399,7 +390,8 @@ def summary(plan, filled, layout) -> str:
         lines.append(f"not in the files, initialised: {', '.join(whole + shown)}")
     if "prompt/rows" in initial and plan.config.parts != "reconstruction":
         lines.append(
-            "no prompt embedding: its rows are zero; the published transformers expect --t5 or --prompt-embedding"
+            f"no prompt embedding: its rows are zero, as no published transformer was trained; with {umt5.FILE} beside "
+            "--wan they are made (or give --t5 or --prompt-embedding)"
         )
     return "\n".join(lines)
 

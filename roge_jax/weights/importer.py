@@ -59,7 +59,9 @@ class Plan(NamedTuple):
     config: RoGeConfig
     specs: dict[str, Spec]  # by path, in the order of writing
     fills: list[Fill]
-    given: dict[str, np.ndarray]
+    given: Mapping[
+        str, np.ndarray | Callable[[], np.ndarray]
+    ]  # a function: made when it is written
     half: bool  # frozen matrices in bfloat16
     provenance: dict[str, Any]
     seed: int = 0
@@ -219,6 +221,7 @@ def write(
     """
     part = check_output(out)
     layout = plan.layout(shard_bytes)
+    plan = plan._replace(given={p: v() if callable(v) else v for p, v in plan.given.items()})
     record = _record(plan, layout)
     done = _resumable(part, record) if resume else 0
     if not done:
@@ -299,7 +302,9 @@ def _record(plan: Plan, layout: Layout) -> dict:
         ],
         "config": json.loads(json.dumps(to_dict(plan.config))),
         "pieces": [[fill.path, fill.layer, fill.key] for fill in plan.fills],
-        "given": {p: hashlib.sha256(v.tobytes()).hexdigest() for p, v in plan.given.items()},
+        "given": {
+            p: hashlib.sha256(np.asarray(v).tobytes()).hexdigest() for p, v in plan.given.items()
+        },
         "dtype": "bfloat16" if plan.half else "float32",
         "seed": plan.seed,
         "sizes": layout.sizes,

@@ -769,30 +769,33 @@ def t5_folder(folder: Path, without: str = "") -> Path:
 
 def test_a_text_encoder_that_memory_does_not_hold(files, tmp_path, monkeypatch):
     plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
+    asked = [*plain, "--t5", t5, "--prompt", "a cat"]
     for free, fits in ((4000.0, True), (3999.0, False)):  # 2000 values in bfloat16
         monkeypatch.setattr(memory, "memory_available", lambda free=free: free)
         if fits:
-            run(*plain, "--t5", t5, "--dry-run")
+            run(*asked, "--dry-run")
         else:
-            fails("for the text encoder alone: close other programs", *plain, "--t5", t5)
+            fails("for the text encoder alone: close other programs", *asked)
     (t5 / "text_encoder/model.safetensors").write_bytes(b"cut")
-    fails(r"model\.safetensors is not a safetensors file", *plain, "--t5", t5)
+    fails(r"model\.safetensors is not a safetensors file", *asked)
 
 
 def test_options_of_the_prompt_that_would_be_ignored(files, tmp_path, capsys):
     plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
-    fails("--prompt 'a cat' needs an encoder", *plain, "--prompt", "a cat")
-    fails("--prompt 'a cat' needs an encoder", *everything(files), "--prompt", "a cat")
+    cat = ["--prompt", "a cat"]
+    fails("--prompt 'a cat' needs an encoder", *plain, *cat)
+    fails("--prompt 'a cat' needs an encoder", *everything(files), *cat)
     fails("both give the prompt: leave one", *everything(files), "--t5", t5)
-    fails("no umT5 encoder and tokenizer there", *plain, "--t5", tmp_path / "nowhere")
+    fails("nowhere does not exist", *plain, "--t5", tmp_path / "nowhere")
+    fails("no umT5 encoder and tokenizer there", *plain, "--t5", tmp_path / "nowhere", *cat)
     for i, lost in enumerate(("config.json", "model.safetensors", "tokenizer.json")):
         name = f"{'tokenizer' if 'tokenizer' in lost else 'text_encoder'}/{lost}"
         part = t5_folder(tmp_path / f"{i}", without=name)
-        fails("no umT5 encoder and tokenizer there", *plain, "--t5", part)
+        fails("no umT5 encoder and tokenizer there", *plain, "--t5", part, *cat)
     (t5 / "text_encoder/config.json").write_text('{"model_type": "bert"}')
-    fails("is of model type bert", *plain, "--t5", t5)
+    fails("is of model type bert", *plain, "--t5", t5, *cat)
     capsys.readouterr()
-    run(*plain, "--t5", t5_folder(tmp_path / "good"), "--prompt", "a cat", "--dry-run")
+    run(*plain, "--t5", t5_folder(tmp_path / "good"), *cat, "--dry-run")
     assert "no prompt embedding" not in capsys.readouterr().out
 
 
