@@ -19,6 +19,7 @@ from roge_jax.geometry.trajectories import PRESETS, make_path
 from roge_jax.scenes.paths import load_path
 from roge_jax.scenes.scene import load_scene
 from roge_jax.viewer import keyframes, route, runs
+from roge_jax.viewer.levels import Pace
 from roge_jax.viewer.live import Live, View, Worker
 from roge_jax.viewer.route import Route
 from roge_jax.viewer.session import Given, Session
@@ -214,6 +215,7 @@ def test_coverage_is_high_at_a_photo_and_nothing_behind_it(live, ours):
 
 def test_the_thread_serves_two_viewers_and_ends(live, ours):
     shown, failed = [], []
+    live.pace = Pace((None,) * len(live.levels))  # or one moves at the finest level at once
     worker = Worker(live, lambda who, what: shown.append((who, what)), failed.append)
     worker.ask("a", view_of(ours, 0))
     worker.ask("b", view_of(ours, 1))
