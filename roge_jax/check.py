@@ -1,9 +1,11 @@
-"""What is wrong with a scene, where, and how to mend it.
+"""What is wrong with a scene, where, and how to mend it; or what a model folder can do.
 
     python -m roge_jax.check SCENE [--json] [--convention opencv] [--no-matching]
+    python -m roge_jax.check SCENE --checkpoint weights/lagernvs      for the pictures of that model
+    python -m roge_jax.check weights/lagernvs                         the model itself
 
 SCENE is a folder or file in any layout that `scenes.readers` knows, `motorcycle` or
-`procedural:SEED`. Exit code 0 if the scene can be used, 2 if not.
+`procedural:SEED`. Exit code 0 if the scene (or the model) can be used, 2 if not.
 """
 
 import argparse
@@ -35,6 +37,7 @@ from roge_jax.metrics.geometry import straightness
 from roge_jax.scenes.matching import pose_agreement
 from roge_jax.scenes.scene import Scene, is_nerfstudio, open_scene
 
+SIZE = (192, 336)  # of pictures
 BAD_FIT = 3.0  # pixels of median epipolar distance: good poses 0.1 to 1, wrong axes 20 and more
 GOOD_FIT = 1.0  # what another convention must reach to be named
 
@@ -45,9 +48,10 @@ class Config:
 
     scene: str
     json: bool = False
+    checkpoint: str | None = None
     convention: str | None = None
-    height: int = 192
-    width: int = 336
+    height: int | None = None
+    width: int | None = None
     matching: bool = True
     debug: bool = False
 
@@ -68,13 +72,15 @@ class Report:
 
 def check(config: Config) -> Report:
     """Reads the scene without stopping at the first fault and reports all of them."""
+    config = sized(config)
+    height, width = config.height or SIZE[0], config.width or SIZE[1]
     try:
         scene = open_scene(
             config.scene,
             convention=config.convention,
             frames=8,
-            height=config.height,
-            width=config.width,
+            height=height,
+            width=width,
             supersample=1,
         )
     except UserError as error:
@@ -97,6 +103,20 @@ def check(config: Config) -> Report:
     return Report(config.scene, numbers, sorted(findings, key=lambda f: order.index(f.severity)))
 
 
+def sized(config: Config) -> Config:
+    """With the size of the pictures to be made: as given, or the model's. Raises: UserError for a model that makes none."""
+    size = SIZE
+    if config.checkpoint is not None:
+        from roge_jax.checkpoint import find_model, load_config
+        from roge_jax.sampling.reconstruction import check_makes_pictures
+
+        made_by = load_config(find_model(config.checkpoint))
+        check_makes_pictures(made_by, config.checkpoint)
+        size = made_by.output_size
+    height, width = config.height or size[0], config.width or size[1]
+    return dataclasses.replace(config, height=height, width=width)
+
+
 def _sizes(scene: Scene) -> dict[str, int]:
     """How many photos have which size, e.g. {"640 x 426": 15}."""
     sizes = [f"{width} x {height}" for height, width in scene.sizes]
@@ -111,7 +131,7 @@ def _numbers(scene: Scene, cameras: Cameras, config: Config) -> dict[str, Any]:
     ]
     steps = np.linalg.norm(np.diff(cameras.centres, axis=0), axis=-1)
     front, behind = axes_votes(cameras.c2w[:: max(1, len(cameras) // 40)])
-    size = (config.height, config.width)
+    size = (config.height or SIZE[0], config.width or SIZE[1])
     windows = [cover_window(source, size) for source in scene.sizes]
     kept = [w[2] * w[3] / (s[0] * s[1]) for w, s in zip(windows, scene.sizes, strict=True)]
     return {
@@ -174,10 +194,11 @@ def _about_photos(scene: Scene, config: Config) -> list[Finding]:
     if max(aspects) > 2 * min(aspects):
         what = f"aspect ratios from {min(aspects):.2f} to {max(aspects):.2f}"
         findings.append(Finding("warning", "photos", what, "use only alike ones together"))
-    gap = max(config.width / config.height / a for a in aspects)
-    gap = max(gap, max(a * config.height / config.width for a in aspects))
+    height, width = config.height or SIZE[0], config.width or SIZE[1]
+    gap = max(width / height / a for a in aspects)
+    gap = max(gap, max(a * height / width for a in aspects))
     if gap > 2:
-        what = f"{config.width} x {config.height} pictures keep only {1 / gap:.0%} of a photo"
+        what = f"{width} x {height} pictures keep only {1 / gap:.0%} of a photo"
         findings.append(Finding("warning", "photos", what, "choose a height and width like theirs"))
     return findings
 
@@ -232,6 +253,10 @@ def other_causes(scene: Scene, cameras: Cameras) -> dict[str, tuple[Cameras, str
 def render(report: Report) -> str:
     """The report for people."""
     n = report.numbers
+    if "parts" in n:
+        from roge_jax.sampling.abilities import render_model
+
+        return render_model(report.scene, n, report.findings)
     lines = [f"scene     {report.scene}"]
     if n:
         sizes = ", ".join(f"{count} of {size}" for size, count in n["sizes"].items())
@@ -263,9 +288,14 @@ def _span(low: float, high: float) -> str:
 
 def main(config: Config) -> int:
     """Prints the report; the exit code."""
+    from roge_jax.sampling.abilities import inspect_model, is_model
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # all of it is in the report
-        report = check(config)
+        if is_model(config.scene):
+            report = Report(config.scene, *inspect_model(config.scene))
+        else:
+            report = check(config)
     if config.json:
         content = dataclasses.asdict(report) | {"usable": report.usable}
         print(json.dumps(plain(content), indent=1, allow_nan=False))
@@ -281,16 +311,19 @@ def parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawTextHelpFormatter,
     )
-    p.add_argument("scene", help="a scene folder or file, motorcycle or procedural:SEED")
+    p.add_argument(
+        "scene", help="a scene folder or file, motorcycle or procedural:SEED; or a model folder"
+    )
     p.add_argument("--json", action="store_true", help="print the report as JSON")
     p.add_argument(
         "--convention",
         type=one_of(CONVENTIONS),
         help=f"axes of the poses of a transforms.json: {', '.join(CONVENTIONS)}",
     )
-    size = "of the pictures to be made, to say how much of a photo the crop keeps (default: {})"
-    p.add_argument("--height", type=number(1), default=192, help=size.format(192))
-    p.add_argument("--width", type=number(1), default=336, help=size.format(336))
+    size = "of the pictures to be made, to say how much of a photo the crop keeps (default: {} or the model's)"
+    p.add_argument("--height", type=number(1), help=size.format(SIZE[0]))
+    p.add_argument("--width", type=number(1), help=size.format(SIZE[1]))
+    p.add_argument("--checkpoint", help="the model that is to make them: its size counts")
     p.add_argument(
         "--matching",
         action=argparse.BooleanOptionalAction,

@@ -16,6 +16,7 @@ WAN_LATENT_STD = (
     2.8184, 1.4541, 2.3275, 2.6558, 1.2196, 1.7708, 2.6052, 2.0743,
     3.2687, 2.1526, 2.8652, 1.5579, 1.6382, 1.1253, 2.8251, 1.9160,
 )  # fmt: skip
+Parts = Literal["all", "reconstruction", "generator"]
 
 
 @dataclass(frozen=True)
@@ -150,9 +151,12 @@ class RoGeConfig:
     fusion: FusionConfig = field(default_factory=FusionConfig)
     flow: FlowConfig = field(default_factory=FlowConfig)
     lora: LoraConfig = field(default_factory=LoraConfig)
+    # All of the model, or one of its halves as published weights come: a reconstruction makes pictures by itself, a
+    # generator needs one.
+    parts: Parts = "all"
 
     def __post_init__(self):
-        pixels = 8 * self.dit.patch
+        pixels = self.multiple
         if min(self.height, self.width) < 1 or self.height % pixels or self.width % pixels:
             raise UserError(
                 f"Size {self.height}x{self.width} does not fit: height and width must be multiples of "
@@ -184,6 +188,11 @@ class RoGeConfig:
             raise UserError(
                 f"{self.frames} frames cannot form latent slots: need 1 + 4k, e.g. {1 + 4 * k} or {5 + 4 * k}."
             )
+
+    @property
+    def multiple(self) -> int:
+        """What height and width are multiples of: a patch of latents, or of rays where nothing is generated."""
+        return self.renderer.patch if self.parts == "reconstruction" else 8 * self.dit.patch
 
     @property
     def output_size(self) -> tuple[int, int]:
@@ -218,7 +227,7 @@ class RoGeConfig:
     def for_pictures(self, height: int, width: int) -> "RoGeConfig":
         """The model for pictures of this size: where colours come from the photos, at about as many pixels as it was made
         for and in the picture's shape; else at the picture's size itself."""
-        pixels = 8 * self.dit.patch
+        pixels = self.multiple
         if not self.renderer.lookup or height * width <= self.height * self.width:
             return dataclasses.replace(self, output=None).at_size(height, width)
         side = math.sqrt(self.height * self.width / (height * width))

@@ -1,5 +1,6 @@
 """Convert published weights: `python -m roge_jax.convert --wan DIR --lagernvs FILE --out DIR`.
 
+    --lagernvs lagernvs_general_512 --out weights/lagernvs      a reconstruction alone, which makes pictures at once
     --wan Wan2.1-I2V-14B-480P --lagernvs model.pt --prompt-embedding empty.safetensors --out weights/paper
     --wan Wan2.1-T2V-1.3B --lagernvs model.pt --t5 umt5-xxl --out weights/wan1.3b
     ... --dry-run                reads headers alone and prints what would fill what
@@ -14,27 +15,41 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from .config import Parts
 from .files.entry import number, one_of
 
 NETWORKS = ("encoder", "renderer", "vae", "dit")
+MAKES = {
+    "all": "makes video, once the link between its halves was trained (train --stage lora); --preview-only at once",
+    "reconstruction": "makes the reconstruction's own picture of any view: sample, evaluate and view take it as it is",
+    "generator": "makes no picture of a scene: it needs a reconstruction, --lagernvs, and training",
+}
 CONDITIONED = 36  # input channels of the conditioned transformer: noisy 16, mask 4, condition 16
 
 
 def parser() -> argparse.ArgumentParser:
     """The options of `python -m roge_jax.convert`."""
+    from .weights import catalogue
+
     p = argparse.ArgumentParser(
         prog="python -m roge_jax.convert",
         description=__doc__,
         formatter_class=argparse.RawTextHelpFormatter,
     )
     p.add_argument(
-        "--wan", type=Path, help="Wan2.1 transformer: official or diffusers folder, or its file"
+        "--wan",
+        type=Path,
+        help="Wan2.1 transformer: official or diffusers folder, or its file; alone it makes no pictures",
     )
     p.add_argument(
         "--wan-vae", type=Path, help="Wan2.1_VAE.pth or diffusers' vae (default: beside --wan)"
     )
     p.add_argument(
-        "--lagernvs", type=Path, help="LagerNVS checkpoint, model.pt: encoder and renderer"
+        "--lagernvs",
+        type=Path,
+        metavar="FILE|NAME",
+        help="LagerNVS checkpoint, model.pt or its folder: encoder and renderer; without --wan a model that makes\n"
+        f"the reconstruction's own picture; also by name: {', '.join(catalogue.LAGERNVS)}",
     )
     p.add_argument(
         "--vggt", type=Path, help="VGGT-1B, where LagerNVS is not at hand: the aggregator alone"
@@ -50,9 +65,14 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--t5",
         type=Path,
-        help="umT5 encoder and tokenizer (Hugging Face folder) to compute them with",
+        help="umT5 encoder to compute them with: models_t5_umt5-xxl-enc-bf16.pth, or a Hugging Face folder with its\n"
+        "tokenizer (default: what lies beside --wan)",
     )
-    p.add_argument("--prompt", default="", help="the prompt for --t5 (default: the empty prompt)")
+    p.add_argument(
+        "--prompt",
+        default="",
+        help="the prompt for --t5 (default: the empty prompt); any other needs the extra 'convert'",
+    )
     p.add_argument(
         "--random",
         nargs="+",
@@ -132,14 +152,12 @@ def main(args: argparse.Namespace) -> None:
 
 
 def make_plan(args: argparse.Namespace):
-    """(plan, what each file does), from headers alone but for the prompt. Raises: UserError with all mismatches."""
-    import numpy as np
-
+    """(plan, what each file does), from headers alone. Raises: UserError with all mismatches."""
     from .core.params import flatten
     from .errors import UserError
     from .model import specs
-    from .weights import importer, published
-    from .weights.prompt import check_encoder, encode_prompt, read_prompt
+    from .weights import catalogue, importer, published, umt5
+    from .weights.prompt import choose_rows
     from .weights.sources import open_source
 
     filled: list[Any] = []
@@ -156,16 +174,14 @@ def make_plan(args: argparse.Namespace):
         )
     if args.t5 and args.prompt_embedding:
         raise UserError("--t5 and --prompt-embedding both give the prompt: leave one of them away.")
-    if args.t5:
-        check_encoder(args.t5)
     if args.wan:
         wan, vae_path = published.find_wan(args.wan)
     if args.lagernvs or args.vggt:
-        recon = open_source(args.lagernvs or args.vggt)
+        recon = open_source(catalogue.locate(args.lagernvs or args.vggt))
         kind = ("lagernvs", "a LagerNVS checkpoint") if args.lagernvs else ("vggt", "VGGT-1B")
         published.expect(recon, kind[:1], role, kind[1])
     if args.lagernvs and args.vggt:
-        unused = open_source(args.vggt)
+        unused = open_source(catalogue.locate(args.vggt))
         published.expect(unused, ("vggt",), "--vggt", "VGGT-1B")
         note = "not needed: LagerNVS brings its own, further trained aggregator"
         filled.append(published.Filled("--vggt", unused, "official", [], [], (note,)))
@@ -175,8 +191,9 @@ def make_plan(args: argparse.Namespace):
     vae_path = args.wan_vae or vae_path
     vae = open_source(vae_path) if vae_path else None
 
-    config = choose_config(args.preset, wan, recon)
-    _require(args, config, wan, vae, recon)
+    have = {"dit": wan, "vae": vae, "encoder": recon, "renderer": recon}
+    parts = _parts(args, have)
+    config = choose_config(args.preset, wan, recon, parts)
     if wan is not None:
         filled += published.fill_dit(config.dit, wan, framecrafter)
     if vae is not None:
@@ -186,16 +203,16 @@ def make_plan(args: argparse.Namespace):
     importer.report(fault for part in filled for fault in part.faults)
 
     given: dict[str, Any] = {}
-    if config.dit.text_len and args.prompt_embedding:
-        given["prompt/rows"] = read_prompt(args.prompt_embedding, config.dit)
-    elif config.dit.text_len and args.t5 and args.dry_run:  # in place of what umT5 will say
-        given["prompt/rows"] = np.zeros((config.dit.text_len, config.dit.text_dim), np.float32)
-    elif config.dit.text_len and args.t5:
-        given["prompt/rows"] = encode_prompt(args.t5, args.prompt, config.dit)
-    elif args.prompt_embedding or (args.t5 and not config.dit.text_len):
-        raise UserError(
-            f"Preset '{config.name}' reads no text: leave --prompt-embedding and --t5 away."
-        )
+    wanted = parts != "reconstruction" and config.dit.text_len > 0
+    if not wanted and (args.prompt_embedding or args.t5):
+        which = "A reconstruction alone" if parts == "reconstruction" else f"Preset '{config.name}'"
+        raise UserError(f"{which} reads no text: leave --prompt-embedding and --t5 away.")
+    said = "none"
+    if wanted:
+        beside = umt5.find(catalogue.locate(args.wan)) if args.wan else None
+        how = {"embedding": args.prompt_embedding, "encoder": args.t5, "beside": beside}
+        said, rows = choose_rows(config.dit, args.prompt, **how)
+        given = {} if rows is None else {"prompt/rows": rows}
     fills = [fill for part in filled for fill in part.fills]
     tree = flatten(specs(config))
     importer.check_coverage(fills, tree)
@@ -211,15 +228,15 @@ def make_plan(args: argparse.Namespace):
             }
             for part in filled
         ],
-        "prompt": _prompt_note(args),
+        "prompt": said,
         "initialised": plan.initialised,
         "seed": args.seed,
     }
     return plan._replace(provenance=provenance), filled
 
 
-def choose_config(name: str | None, wan, recon):
-    """The configuration: a preset, that of a model folder, or the sizes found in the files."""
+def choose_config(name: str | None, wan, recon, parts: Parts = "all"):
+    """The configuration: a preset, that of a model folder, or the sizes found in the files; of `parts` of the model."""
     from . import checkpoint, config
     from .errors import UserError
     from .weights import published
@@ -234,6 +251,11 @@ def choose_config(name: str | None, wan, recon):
         chosen = None
     found = published.dit_config(wan) if wan is not None else None
     if chosen is not None:
+        if parts == "reconstruction":
+            size = chosen.recon_height, chosen.recon_width
+            chosen = dataclasses.replace(
+                chosen, parts=parts, height=size[0], width=size[1], output=None
+            )
         if found is not None and (found.width, found.depth) != (chosen.dit.width, chosen.dit.depth):
             fits = [p for p in config.PRESETS if _same_size(config.preset(p).dit, found)]
             raise UserError(
@@ -241,13 +263,17 @@ def choose_config(name: str | None, wan, recon):
                 f"'{chosen.name}' has {chosen.dit.width} and {chosen.dit.depth}: "
                 f"use {'--preset ' + fits[0] if fits else 'no --preset to take the sizes of the file'}."
             )
-        return chosen
-    chosen = config.RoGeConfig()
+        return dataclasses.replace(chosen, parts=parts)
+    if parts == "reconstruction":
+        return alone(recon)
+    chosen = config.RoGeConfig(parts=parts)
     if found is not None:
         dit = dataclasses.replace(found, in_channels=CONDITIONED)
         same = [p for p in config.PRESETS if config.preset(p).dit == dit]
         chosen = (
-            config.preset(same[0]) if same else dataclasses.replace(chosen, name="custom", dit=dit)
+            dataclasses.replace(config.preset(same[0]), parts=parts)
+            if same
+            else dataclasses.replace(chosen, name="custom", dit=dit)
         )
     if recon is not None:
         encoder, renderer = published.recon_config(recon)
@@ -261,9 +287,38 @@ def _same_size(a, b) -> bool:
     return (a.width, a.depth) == (b.width, b.depth)
 
 
-def _require(args, config, wan, vae, recon) -> None:
-    """Every network has a file or is declared random."""
+def alone(recon):
+    """The configuration of a LagerNVS file without a generator: pictures of the size that it was trained for."""
+    from .config import RoGeConfig
+    from .weights import catalogue, published
+
+    encoder, renderer = published.recon_config(recon)
+    name = catalogue.name_of(recon.path)
+    known = name if name in catalogue.LAGERNVS else None
+    like = known or "lagernvs_general_512"
+    if known is None and renderer is not None and renderer.attention == "full":
+        like = "lagernvs_re10k_2v_256"  # the one with full attention
+    (height, width), views = catalogue.LAGERNVS[like]
+    return RoGeConfig(
+        name=known or "lagernvs",
+        height=height,
+        width=width,
+        recon_height=height,
+        recon_width=width,
+        max_context=views,
+        encoder=encoder,
+        renderer=renderer,
+        parts="reconstruction",
+    )
+
+
+def _parts(args, have: dict[str, Any]) -> Parts:
+    """Which parts of the model there will be: all, or the half that anything was given for.
+
+    Raises: UserError unless every network of it has a file or is declared random.
+    """
     from .errors import UserError
+    from .model import RECONSTRUCTION
 
     options = {
         "dit": "--wan",
@@ -271,29 +326,36 @@ def _require(args, config, wan, vae, recon) -> None:
         "encoder": "--lagernvs",
         "renderer": "--lagernvs",
     }
-    have = {"dit": wan, "vae": vae, "encoder": recon, "renderer": recon}
-    lost = [name for name in NETWORKS if have[name] is None and name not in args.random]
     both = [name for name in args.random if have[name] is not None]
     if both:
         raise UserError(
             f"--random {both[0]}, but a file fills it as well: leave one of the two away."
         )
+    given = [name for name in NETWORKS if have[name] is not None or name in args.random]
+    halves = {name in RECONSTRUCTION for name in given}
+    if not any(have.values()):
+        raise UserError(
+            "No file to convert: give --lagernvs (a reconstruction, which makes pictures by itself), --wan (a generator), "
+            "or both."
+        )
+    if halves == {True} and not args.lagernvs:
+        raise UserError(
+            "VGGT-1B alone makes no pictures: its camera MLP, its connector and the renderer are LagerNVS's: give --lagernvs "
+            "instead, or --wan besides, to train what is missing."
+        )
+    lost = [n for n in NETWORKS if n not in given and (n in RECONSTRUCTION) in halves]
     if lost:
         wanted = " and ".join(dict.fromkeys(options[name] for name in lost))
         raise UserError(
             f"Nothing fills {', '.join(lost)}: give {wanted}, or --random {' '.join(lost)} to initialise them."
         )
-
-
-def _prompt_note(args) -> str:
-    if args.prompt_embedding:
-        return f"read from {args.prompt_embedding.name}"
-    return f"umT5 of '{args.prompt}'" if args.t5 else "none: all rows are zero"
+    return "all" if len(halves) == 2 else "reconstruction" if halves == {True} else "generator"
 
 
 def summary(plan, filled, layout) -> str:
     """What fills what, as text for people."""
     from .core.params import count
+    from .weights import umt5
 
     lines = []
     for part in filled:
@@ -315,6 +377,7 @@ def summary(plan, filled, layout) -> str:
         lines.append(
             f"{network:10}{len(specs):8}{tensors:9}{count(specs):16,}{size / 1e9:8.2f}{len(initial & set(specs)):13}"
         )
+    lines.append(MAKES[plan.config.parts])
     lines.append(
         f"preset {plan.config.name}, {sum(layout.sizes) / 1e9:.2f} GB in {len(layout.sizes)} files, "
         f"large matrices in {'bfloat16' if plan.half else 'float32'}"
@@ -325,9 +388,10 @@ def summary(plan, filled, layout) -> str:
             n for n in ("vae", "dit", "renderer") if any(p.startswith(f"{n}/") for p in initial)
         ]
         lines.append(f"not in the files, initialised: {', '.join(whole + shown)}")
-    if "prompt/rows" in initial:
+    if "prompt/rows" in initial and plan.config.parts != "reconstruction":
         lines.append(
-            "no prompt embedding: its rows are zero; the published transformers expect --t5 or --prompt-embedding"
+            f"no prompt embedding: its rows are zero, as no published transformer was trained; with {umt5.FILE} beside "
+            "--wan they are made (or give --t5 or --prompt-embedding)"
         )
     return "\n".join(lines)
 

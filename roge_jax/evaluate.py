@@ -8,6 +8,7 @@ beside its own ceiling (`vae_round_trip`: the truth encoded and decoded). Means 
 All is compared at `--size`, whatever the model's own; frames that the model makes smaller are enlarged.
 A run that was stopped goes on, given the same words, with the scenes that it has in OUT.part.
 With `--close N` N views of every scene are shown instead, each by itself from the `context` photos nearest to it.
+A model that is a reconstruction alone (LagerNVS) has its own picture, `rgb_head`, and no `generated`; it is made at `--size`.
 """
 
 import argparse
@@ -18,13 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from .data.two_sizes import Size, check_output, open_views
+from .data.two_sizes import Size, check_output, expand, open_views
 from .data.two_sizes import spread as spread
 from .errors import UserError
-from .files.entry import number, one_of
+from .files.entry import number, one_of, size_of
 from .files.folders import fingerprint_files, output_file, write_json
 from .files.parts import Item, load_item, parts, save_item
 
+OWN = ("solver", "steps", "schedule")  # of a generator
 SMALLEST = 32  # pixels on a side that LPIPS needs
 HELD_OUT = "procedural:1000000000..1000000049"
 
@@ -89,23 +91,6 @@ def parser() -> argparse.ArgumentParser:
     return p
 
 
-def expand(specs: list[str]) -> list[str]:
-    """Scene names with procedural:FIRST..LAST written out."""
-    names = []
-    for spec in specs:
-        if spec.startswith("procedural:") and ".." in spec:
-            first, _, last = spec.removeprefix("procedural:").partition("..")
-            decimal = first.isdecimal() and last.isdecimal()
-            if not decimal or not int(first) <= int(last) < 2**31:
-                raise UserError(
-                    f"'{spec}' is no range of seeds: write procedural:FIRST..LAST, below 2^31."
-                )
-            names += [f"procedural:{seed}" for seed in range(int(first), int(last) + 1)]
-        else:
-            names.append(spec)
-    return names
-
-
 def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[int], list[int]]]:
     """(context ids, the target alone) of up to `count` views, evenly over all: the views nearest to each, nearest first.
 
@@ -126,7 +111,7 @@ def neighbours(c2w: np.ndarray, contexts: int, count: int) -> list[tuple[list[in
 
 
 class Evaluator:
-    """The model's jitted pieces, compiled once for all scenes of a size."""
+    """The model's jitted pieces, compiled once for all scenes of a size. Of a reconstruction alone there is one picture."""
 
     def __init__(
         self, checkpoint: str, solver: str = "", steps: int = 0, seed: int = 0, schedule: str = ""
@@ -137,14 +122,20 @@ class Evaluator:
         import jax
 
         from . import model, sampling
-        from .checkpoint import load_model
+        from .checkpoint import find_model, load_config, load_model
+        from .sampling.reconstruction import check_makes_pictures
         from .sampling.windows import window_noise
         from .video import flow, solvers, vae
 
+        config = load_config(find_model(checkpoint))
+        check_makes_pictures(config, checkpoint)
+        self.alone = config.parts == "reconstruction"
         self._prepare: dict[Size, Any] = {}
+        self._programs: dict[Any, Any] = {}
         self.params, self.config = load_model(checkpoint)
-        config = self.config
         self.settings = s = sampling.Settings(steps, solver, schedule).of(config)
+        if self.alone:
+            return
         grid = flow.schedule(
             s.schedule, s.steps, shift=config.flow.shift, solver=s.solver, model=config.name
         )
@@ -176,6 +167,8 @@ class Evaluator:
         """{"generated", "rgb_head", "vae_round_trip"}: [n, h, w, 3] for the targets of one `take`, at the model's size or,
         of models that read colours from the photos, at the output size, from the whole photos.
         """
+        if self.alone:
+            return {"rgb_head": self.preview(scene)}
         from .data.views import make_sample
         from .geometry.cameras import Cameras
         from .geometry.packing import pad_path
@@ -207,6 +200,21 @@ class Evaluator:
             "rgb_head": shown if full is None else full,
             "vae_round_trip": np.asarray(self.decode(self.params, encoded))[:n],
         }
+
+    def preview(self, scene: dict[str, Any]) -> np.ndarray:
+        """What a reconstruction alone makes of one `take` [n, h, w, 3], as `sample` does."""
+        from .geometry.cameras import Cameras
+        from .sampling import Photos, preview
+        from .sampling.whole import whole
+
+        m, config = len(scene["context"]), self.config
+        size, full = (config.height, config.width), None
+        if config.output_size != size:
+            full = whole(scene["photos"], config.output_size, size)
+        K, c2w = scene["K"], scene["c2w"]
+        photos = Photos(scene["rgb"][:m], None, Cameras(K[:m], c2w[:m]), tuple(range(m)), full)
+        path = Cameras(K[m:], c2w[m:])
+        return preview(self.params, config, photos, path, cache=self._programs).frames
 
 
 def samples(
@@ -328,21 +336,20 @@ def learned_metrics(choice: str | None) -> dict[str, Any]:
         return {}
 
 
-def size_of(text: str) -> Size:
-    """HEIGHTxWIDTH."""
-    height, _, width = text.partition("x")
-    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
-        raise argparse.ArgumentTypeError(
-            f"'{text}' is no size: write HEIGHTxWIDTH in pixels, e.g. 192x336"
-        )
-    return int(height), int(width)
+def check_alone(args: argparse.Namespace) -> None:
+    """Raise UserError for options of a generator, which a reconstruction alone has not."""
+    for name in OWN:
+        if (value := getattr(args, name)) is not None:
+            raise UserError(
+                f"--{name} {value} is for the generator, and {args.checkpoint} is a reconstruction alone: leave it away."
+            )
 
 
 def main(args: argparse.Namespace) -> dict[str, Any]:
     """Evaluate all scenes, write OUT and return the document (`metrics.report.build`)."""
     from tqdm import tqdm
 
-    from .checkpoint import find_model
+    from .checkpoint import find_model, load_config
     from .metrics import report
     from .metrics.scores import SETTINGS
 
@@ -356,10 +363,16 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
     if args.sweep and not args.sweep[0] <= args.sweep[1]:
         raise UserError(f"--sweep {args.sweep[0]:g} {args.sweep[1]:g}: give LOW, then HIGH.")
     check_scenes(args, names)
+    if load_config(find_model(args.checkpoint)).parts == "reconstruction":
+        check_alone(args)
     learned = learned_metrics(args.lpips)
     evaluator = Evaluator(
         args.checkpoint, args.solver or "", args.steps or 0, args.seed, args.schedule or ""
     )
+    if evaluator.alone:
+        evaluator.config = evaluator.config.for_pictures(
+            *(args.size or evaluator.config.output_size)
+        )
     config = evaluator.config
     size = (config.height, config.width)
     output = args.size or config.output_size
@@ -378,9 +391,7 @@ def main(args: argparse.Namespace) -> dict[str, Any]:
         "context": args.context,
         "close": args.close,
         "frames": config.frames,
-        "solver": evaluator.settings.solver,
-        "steps": evaluator.settings.steps,
-        "schedule": evaluator.settings.schedule,
+        **({} if evaluator.alone else {name: getattr(evaluator.settings, name) for name in OWN}),
         "seed": args.seed,
         "sweep": args.sweep,
         "convention": args.convention,

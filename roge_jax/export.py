@@ -161,7 +161,7 @@ def _same_shapes(part: str, a, b) -> bool:
     from .core.params import abstract, flatten
 
     shapes = [
-        {p: s.shape for p, s in flatten(abstract(model.specs(config)[part])).items()}
+        {p: s.shape for p, s in flatten(abstract(model.specs(config).get(part, {}))).items()}
         for config in (a, b)
     ]
     return shapes[0] == shapes[1]

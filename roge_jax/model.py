@@ -43,8 +43,12 @@ Views = dict[str, Any]
 NEW_EMBEDDINGS = r"^fusion/|^dit/patch_embed/"
 
 
+# The half that makes pictures by itself: its parts of the parameter tree.
+RECONSTRUCTION = ("encoder", "renderer")
+
+
 def specs(config: RoGeConfig) -> Tree:
-    """Every leaf of the model."""
+    """Every leaf of the model, or of the half that `config.parts` names."""
     tree = {
         "encoder": vggt.encoder_specs(config.encoder, config.renderer.width),
         "renderer": ray_scene.renderer_specs(config.renderer),
@@ -57,14 +61,20 @@ def specs(config: RoGeConfig) -> Tree:
     ):  # the prompt's text embedding, zero-padded: text encoders are not needed afterwards
         shape = (config.dit.text_len, config.dit.text_dim)
         tree["prompt"] = {"rows": Spec(shape, (None, None), zeros)}
-    return tree
+    if config.parts == "all":
+        return tree
+    half = config.parts == "reconstruction"
+    return {name: part for name, part in tree.items() if (name in RECONSTRUCTION) == half}
 
 
 def init(key: jax.Array, config: RoGeConfig, *, make: Callable = init_specs) -> Tree:
     """Random parameters (the VAE from its pass-through initialisation). With `make=params.drawn` all others are drawn
     when they are asked for.
     """
-    tree = make(key, {k: s for k, s in specs(config).items() if k != "vae"})
+    want = specs(config)
+    tree = make(key, {k: s for k, s in want.items() if k != "vae"})
+    if "vae" not in want:
+        return tree
     return tree | {"vae": vae_training.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
 
 

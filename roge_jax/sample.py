@@ -10,6 +10,7 @@
 
 OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., transforms.json (the frames with
 their cameras, in the scene's frame and unit), contact_sheet.png and run.json. docs/start/first_video.md explains everything.
+A model that is a reconstruction alone, such as LagerNVS, makes its own picture; nothing is generated, and preview.mp4 is left out.
 """
 
 import argparse
@@ -139,7 +140,7 @@ def main(args: argparse.Namespace) -> None:
 
         return print(describe())
     if args.preview_only:
-        check_preview_only(args)
+        check_options(args, "--preview-only runs none: leave one of the two away")
     settings = sampling.Settings(
         steps=args.steps or 0,
         solver=args.solver or "",
@@ -156,13 +157,11 @@ def main(args: argparse.Namespace) -> None:
         raise UserError("--target and --compile belong to --dry-run: add it, or leave them out.")
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
-    settings = settings.of(config)
+    settings, only = settings.of(config), previews(args, config)
     with output_folder(args.out) as folder, sharding.use(mesh):
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
-            params, _ = load_weights(
-                args, mesh, reconstruction.PARTS if args.preview_only else None
-            )
+            params, _ = load_weights(args, mesh, reconstruction.PARTS if only else None)
         beside = Beside(scene, photos.ids, config, args.convention)
         print(
             f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.output_size[0]}x{config.output_size[1]}, {config.name}"
@@ -184,7 +183,7 @@ def main(args: argparse.Namespace) -> None:
             print(plan.explain())
         stage = beside.before_work(clock)
         given = params, config, photos, path
-        if args.preview_only:
+        if only:
             result = sampling.preview(*given, scale=args.scale, stage=stage, progress=True)
         else:
             result = sampling.sample(*given, settings, plan=plan, stage=stage, progress=True)
@@ -192,8 +191,8 @@ def main(args: argparse.Namespace) -> None:
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
         with clock("write"):
-            write_outputs(folder, result, photos, args.fps, generated=not args.preview_only)
-        used = {"scale": args.scale} if args.preview_only else dataclasses.asdict(settings)
+            write_outputs(folder, result, photos, args.fps, generated=not only)
+        used = {"scale": args.scale} if only else dataclasses.asdict(settings)
         content = record(
             "roge_jax.sample",
             vars(args),
@@ -203,7 +202,7 @@ def main(args: argparse.Namespace) -> None:
             photos,
             result,
             clock,
-            generated=not args.preview_only,
+            generated=not only,
         )
         content |= {} if plan is None else {"plan": dataclasses.asdict(plan)}
         write_json(folder / "run.json", content)
@@ -213,12 +212,21 @@ def main(args: argparse.Namespace) -> None:
     print(
         f"{stages}; peak memory {content['stages']['total'].get('peak_memory_gb', float('nan')):.2f} GB"
     )
-    videos = "video.mp4, the preview" if args.preview_only else "video.mp4, preview.mp4"
+    if only:
+        print(f"{content['seconds_per_frame']:.3f} s a frame")
+    videos = "video.mp4, the preview" if only else "video.mp4, preview.mp4"
     print(f"wrote {args.out}/ ({videos}, frames, transforms.json, contact_sheet.png, run.json)")
 
 
-def check_preview_only(args: argparse.Namespace) -> None:
-    """Raise UserError for options of the generator, which does not run."""
+def previews(args: argparse.Namespace, config) -> bool:
+    """Whether nothing is generated: that was asked for, or there is nothing to generate with."""
+    if config.parts == "reconstruction":
+        check_options(args, f"{args.checkpoint} is a reconstruction alone: leave it away")
+    return args.preview_only or config.parts == "reconstruction"
+
+
+def check_options(args: argparse.Namespace, why: str) -> None:
+    """Raise UserError for options of the generator, which does not run, and say `why`."""
     from .errors import UserError
 
     unused = parser()
@@ -236,9 +244,7 @@ def check_preview_only(args: argparse.Namespace) -> None:
         value = getattr(args, name)
         if value != unused.get_default(name):
             option = f"--{name.replace('_', '-')}" + (f" {value}" if value is not True else "")
-            raise UserError(
-                f"{option} is for the generator, and --preview-only runs none: leave one of the two away."
-            )
+            raise UserError(f"{option} is for the generator, and {why}.")
 
 
 def dry_run(args: argparse.Namespace, settings) -> str:
@@ -253,12 +259,12 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         aot.by_the_cpu()
         aot.check(target.name())
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
-    settings, notes = settings.of(config), []
+    settings, notes, only = settings.of(config), [], previews(args, config)
     dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
-        if target.fused(dtype) and not args.preview_only:
+        if target.fused(dtype) and not only:
             sharding.check_heads(config.dit.heads, mesh)
-        held = reconstruction.held_weights if args.preview_only else cost.held_weights
+        held = reconstruction.held_weights if only else cost.held_weights
         kept = held(config, mesh, dtype)
         notes.append(
             f"note: each device holds {cost.scaled(kept, 'B')} of weights; FLOPs and working memory are those of all "
@@ -269,7 +275,7 @@ def dry_run(args: argparse.Namespace, settings) -> str:
     if scene is not None:
         notes.append("note: for any scene with so many photos; none was read")
     m = len(photos.ids)
-    if args.preview_only:
+    if only:
         text = reconstruction.report(config, m, frames=len(path), half=dtype == "bfloat16")
         return "\n".join([text, *notes])
     if args.tolerance is not None or args.max_cost is not None:

@@ -204,10 +204,16 @@ def starting_point(args: argparse.Namespace) -> str:
 
 
 def check_preset(preset, cfg, init: str) -> None:
-    """Raise UserError if the model to start from is that of another preset: its sizes would silently win."""
+    """Raise UserError if the model to start from is half a model, or that of another preset: its sizes would silently win."""
     from .config import PRESETS
     from .errors import UserError
 
+    if cfg.parts != "all":
+        other = "--wan" if cfg.parts == "reconstruction" else "--lagernvs"
+        raise UserError(
+            f"--init {init} is a {cfg.parts} alone, and training needs both halves: convert its files again with {other} as "
+            "well (or --random, to start the other half from nothing)."
+        )
     if cfg.name != preset.name and cfg.name in PRESETS:
         raise UserError(
             f"--init {init} is a '{cfg.name}' model and the preset is '{preset.name}': the model's own sizes count, so "

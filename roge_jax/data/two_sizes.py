@@ -31,6 +31,23 @@ def check_output(output: Size, size: Size, smallest: int) -> None:
         )
 
 
+def expand(specs: list[str]) -> list[str]:
+    """Scene names with procedural:FIRST..LAST written out."""
+    names = []
+    for spec in specs:
+        if spec.startswith("procedural:") and ".." in spec:
+            first, _, last = spec.removeprefix("procedural:").partition("..")
+            decimal = first.isdecimal() and last.isdecimal()
+            if not decimal or not int(first) <= int(last) < 2**31:
+                raise UserError(
+                    f"'{spec}' is no range of seeds: write procedural:FIRST..LAST, below 2^31."
+                )
+            names += [f"procedural:{seed}" for seed in range(int(first), int(last) + 1)]
+        else:
+            names.append(spec)
+    return names
+
+
 def spread(views: int, contexts: int, frames: int) -> tuple[list[int], list[int]]:
     """(context ids, target ids) of a scene: a centred run of views, contexts in the middle of equal parts of it."""
     run = min(views, frames + contexts)

@@ -202,6 +202,16 @@ def number(
     return check
 
 
+def size_of(text: str) -> tuple[int, int]:
+    """An argparse `type` for HEIGHTxWIDTH."""
+    height, _, width = text.partition("x")
+    if not (height.isdecimal() and width.isdecimal() and int(height) and int(width)):
+        raise argparse.ArgumentTypeError(
+            f"'{text}' is no size: write HEIGHTxWIDTH in pixels, e.g. 192x336"
+        )
+    return int(height), int(width)
+
+
 def _expected_stops() -> tuple[type[BaseException], ...]:
     """Errors that mean the computation ended early, not that the program is wrong. Imported only once one is raised."""
     found = []

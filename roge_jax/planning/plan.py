@@ -23,7 +23,7 @@ from ..errors import UserError
 from ..geometry.cameras import Cameras
 from ..sampling.choices import Choices
 from ..sampling.photos import Photos, read_photos
-from ..sampling.video import Settings
+from ..sampling.video import NOTHING_TO_PLAN, Settings
 from ..scenes import coverage
 from ..scenes.scene import Scene
 from . import proxies
@@ -120,6 +120,8 @@ def plan(
     Raises: UserError for values that make no sense and for a `max_cost` below the cheapest plan.
     """
     _check(tolerance, max_cost)
+    if config.parts != "all":
+        raise UserError(NOTHING_TO_PLAN)
     settings = (Settings() if settings is None else settings).of(config)
     photos = scene if isinstance(scene, Photos) else photos_of(scene, config, context, path)
     full = full_choices(photos, config, path, settings)

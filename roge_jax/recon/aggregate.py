@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 RADIUS = 3  # pixels about which luma is normalised
-BELIEF = 2.0  # weight of the network's logarithmic probability beside the evidence
+BELIEF = 1.0  # weight of the network's logarithmic probability beside the evidence
 LEAST = -12.0  # it is not taken for less
 HIDDEN = 20.0  # further cost of cuts that no photo sees
 STEP, JUMP = 1.2, 10.0  # cost of a neighbour one cut, and more than one cut, away

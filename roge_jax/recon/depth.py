@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from ..core.params import Tree
 from .aggregate import box, cheapest, envelope, occupied, semi_global, with_belief
 from .matching import Described, described, evidence
-from .rendering import Photos
+from .rendering import Photos, Pyramid
 from .sweep import Motion, all_cuts, inverse_depth, pixels_of
 
 FINER = 2  # times the model's sides, the fine level
@@ -31,6 +31,22 @@ class Level(NamedTuple):
     @classmethod
     def of(cls, match: Tree | None, photos: Photos) -> "Level":
         return cls(described(match, photos.rgb), photos)
+
+    def among(self, kept: jax.Array) -> "Level":
+        """Some of the photos [k]."""
+        return Level(self.described.among(kept), self.photos.among(kept))
+
+
+def levels_of(match: Tree | None, photos: Photos) -> tuple[Level, Level]:
+    """The coarse level and the fine one."""
+    if photos.levels is not None:
+        return photos.levels
+    return Level.of(match, photos.shrunk()), Level.of(match, photos.shrunk(FINER))
+
+
+def prepared(match: Tree | None, photos: Photos) -> Photos:
+    """Photos with all that is made of them, for those who look again and again."""
+    return photos._replace(pyramid=Pyramid.of(photos.rgb), levels=levels_of(match, photos))
 
 
 class Surfaces(NamedTuple):

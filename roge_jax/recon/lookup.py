@@ -31,7 +31,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
-from .depth import FINER, Level, surfaces
+from .depth import FINER, levels_of, surfaces
 from .matching import matching_specs
 from .rendering import Blend, Photos, render
 from .sweep import (
@@ -155,10 +155,7 @@ def look_up(
 
     alike = twins(photo_cameras[1])
     match = p.get("match")
-    wide, levels = None, None
-    if full is not None:
-        wide = full.photos.shrunk()
-        levels = Level.of(match, wide), Level.of(match, full.photos.shrunk(FINER))
+    levels = None if full is None else levels_of(match, full.photos)
 
     @jax.checkpoint
     def one(way, prior, context, head, far):
@@ -180,18 +177,16 @@ def look_up(
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         looked, _, (mixed, _, _) = choose(cut, found, seen)
         own = Looked(mixed, head, looked, coarse)
-        if wide is None or levels is None:
+        if levels is None:
             return own, None
         h, w = photos.shape[1:3]
         inverse, step = surfaces(match, levels, way, belief, reach, alike, (h, w))
         near = inverse[FINER // 2 :: FINER, FINER // 2 :: FINER]
-        found, seen = (
-            x.reshape(len(x), h, w, -1)
-            for x in fetch(
-                *(wide.rgb, wide.into(way), pixels_of(h, w, 1), near.reshape(1, -1)),
-                size=(wide.size[:, 0], wide.size[:, 1]),
-            )
-        )
+        wide = levels[0].photos
+        size = (wide.size[:, 0], wide.size[:, 1])
+        colours = levels[0].described.plain, wide.into(way)
+        values, seen = fetch(*colours, pixels_of(h, w, 1), near.reshape(1, -1), size)
+        found, seen = values[..., :3].reshape(-1, h, w, 3), seen.reshape(-1, h, w, 1)
         _, share, (_, gate, rest) = choose(cut_at(near, cuts, reach), found, seen)
         return own, Blend(inverse, step, share, gate, head, rest)
 

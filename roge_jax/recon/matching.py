@@ -58,8 +58,12 @@ class Described(NamedTuple):
             return values, seen
         x, y, _ = meet(way, pixels, inverse, size)
         h, w = self.plain.size
-        first = jnp.arange(len(x), dtype=jnp.int32)[:, None, None] * (h * w)
+        first = self.plain.number[:, None, None] * (h * w)
         return jnp.concatenate([nearest(self.vectors, x, y, (h, w), first), values], -1), seen
+
+    def among(self, kept: jax.Array) -> "Described":
+        """Some of the photos [k]."""
+        return self._replace(plain=self.plain._replace(number=self.plain.number[kept]))
 
 
 def described(p: Tree | None, photos: jax.Array) -> Described:

@@ -84,9 +84,9 @@ def decode_all(
         return lookup.Looked(head, head, head, head)
     if (
         finer is not None
-    ):  # its windows are in pixels of the model's size, rays in those of the reconstruction's
+    ):  # its windows are in pixels of the model's size, rays in the reconstruction's
         ratio = config.height / config.recon_height, config.width / config.recon_width
-        finer = finer._replace(scale=finer.scale * jnp.asarray([ratio]))
+        finer = finer.rescaled(jnp.asarray([ratio]))
     photos = recon_photos(context, config)
     K, c2w = recon_cameras(context, config)
     return lookup.look_up(

@@ -27,11 +27,26 @@ class Photos(NamedTuple):
     size: Array  # [m, 2] height and width of each in pixels of `rgb`
     scale: Array  # [m, 2] pixels of `rgb` in one of the model's, down and across
     offset: Array  # [m, 2] where the window begins in `rgb`
-    pyramid: "Pyramid | None" = None  # of `rgb`, where it was made before (`prepared`)
+    # What is made of them, where it was made before (`depth.prepared`): a pyramid of `rgb`, and what is compared.
+    pyramid: "Pyramid | None" = None
+    levels: Any = None
 
-    def prepared(self) -> "Photos":
-        """With their pyramid, for those who look again and again."""
-        return self._replace(pyramid=Pyramid.of(self.rgb))
+    def among(self, kept: jax.Array) -> "Photos":
+        """Some of the photos [k], prepared as all of them are."""
+        rgb, coarse, size, scale, offset = (x[kept] for x in self[:5])
+        pyramid, levels = self.pyramid, self.levels
+        if pyramid is not None:
+            pyramid = pyramid._replace(first=pyramid.first[:, kept])
+        if levels is not None:
+            levels = tuple(level.among(kept) for level in levels)
+        return Photos(rgb, coarse, size, scale, offset, pyramid, levels)
+
+    def rescaled(self, ratio: Array) -> "Photos":
+        """For another size of the model, whose pixels are `ratio` [1, 2] of those now (down, across)."""
+        levels = self.levels
+        if levels is not None:
+            levels = tuple(x._replace(photos=x.photos.rescaled(ratio)) for x in levels)
+        return self._replace(scale=self.scale * ratio, levels=levels)
 
     def shrunk(self, times: int = 1) -> "Photos":
         """The coarse ones in place of `rgb`; `times` as fine, of `rgb`."""

@@ -104,11 +104,12 @@ class Texels(NamedTuple):
 
     rows: jax.Array  # see `texels`
     size: tuple[int, int]  # (height, width)
+    number: jax.Array  # [m] which of the images in `rows` each is
 
     @classmethod
     def of(cls, images: jax.Array) -> "Texels":
-        _, h, w, _ = images.shape
-        return cls(texels(images), (h, w))
+        m, h, w, _ = images.shape
+        return cls(texels(images), (h, w), jnp.arange(m, dtype=jnp.int32))
 
 
 def fetch(
@@ -125,8 +126,8 @@ def fetch(
     held = images if isinstance(images, Texels) else Texels.of(images)
     h, w = held.size
     x, y, seen = meet(way, pixels, inverse, held.size if size is None else size)
-    first = jnp.arange(len(x), dtype=jnp.int32) * ((h - 1) * (w - 1))
-    return bilinear(held.rows, x, y, (h, w), first[:, None, None]), seen
+    first = held.number[:, None, None] * ((h - 1) * (w - 1))
+    return bilinear(held.rows, x, y, (h, w), first), seen
 
 
 def texels(images: jax.Array) -> jax.Array:

@@ -24,6 +24,7 @@ def model_config(args: argparse.Namespace, *, weights: bool):
     """The configuration of --checkpoint at --size; a preset without weights is enough for a dry run."""
     from ..checkpoint import find_model, load_config
     from ..config import PRESETS, preset
+    from .reconstruction import check_makes_pictures
 
     try:
         config = load_config(find_model(args.checkpoint))
@@ -31,6 +32,7 @@ def model_config(args: argparse.Namespace, *, weights: bool):
         if weights or args.checkpoint not in PRESETS:
             raise
         config = preset(args.checkpoint)
+    check_makes_pictures(config, args.checkpoint)
     if args.size is None:
         return config
     try:
@@ -182,7 +184,7 @@ def load_weights(args: argparse.Namespace, mesh=None, parts=None):
 
     config = checkpoint.load_config(checkpoint.find_model(args.checkpoint))
     specs = model.specs(config)
-    if target.platform() == "gpu" and parts is None:
+    if target.platform() == "gpu" and parts is None and config.parts == "all":
         sharding.check_heads(config.dit.heads, mesh)
     dtype = large_dtype(args, count(specs))
     return checkpoint.load_model(

@@ -42,7 +42,12 @@ def record(
     generated: bool = True,
 ) -> dict[str, Any]:
     """run.json: everything needed to know what was made and to make it again."""
-    info = result.normalisation
+    info, stages = result.normalisation, clock.record()
+    pace = (
+        {}
+        if generated
+        else {"seconds_per_frame": stages["preview"]["seconds"] / len(result.frames)}
+    )
     return {
         "program": program,
         **environment(),
@@ -67,6 +72,7 @@ def record(
         "evaluations": result.evaluations,
         "windows": list(result.windows),
         "warnings": [one._asdict() for one in result.warnings],
-        "stages": clock.record(),
+        "stages": stages,
+        **pace,
         "config": to_dict(config),
     }

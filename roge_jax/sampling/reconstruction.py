@@ -7,6 +7,7 @@ Of the parameters it reads those of `PARTS` alone: the generator need not be loa
 a generator; `roge_jax.viewer` asks for one camera at a time.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -18,17 +19,40 @@ import numpy as np
 
 from .. import cost, model
 from ..config import RoGeConfig
-from ..core import sharding
+from ..core import sharding, target
 from ..core.params import Tree
+from ..errors import UserError
 from ..geometry.cameras import Cameras, Normalisation, normalise, to_host
 from ..geometry.packing import pad_path
+from ..recon import depth
 from . import limits, programs
 from .photos import Photos
-from .video import Result, Stage, at_frames, check_photos
+from .video import Bar, Result, Stage, at_frames, check_photos
 from .windows import window_views, windows
 
-PARTS = ("encoder", "renderer")  # of the parameter tree
+PARTS = model.RECONSTRUCTION
 STAGES = ("reconstruct", "query rays", "look into photos")  # of `cost.estimate`
+
+
+def check_makes_pictures(config: RoGeConfig, name: str) -> None:
+    """Raise UserError for a generator alone, which says what it is for."""
+    if config.parts == "generator":
+        raise UserError(
+            f"{name} holds a video generator alone, which sees neither photos nor cameras and makes no picture of a scene "
+            "by itself: convert its files again together with a reconstruction (`python -m roge_jax.convert --wan ... "
+            "--lagernvs ...`), or call its transformer and VAE in Python (roge_jax.video)."
+        )
+
+
+def at_once(config: RoGeConfig, frames: int) -> int:
+    """How many views a program makes, of so many: a chunk of the renderer, so that memory does not grow with the path.
+
+    On a CPU one, where views share nothing: less memory, no slower, and one sees it go on.
+    """
+    shares = config.renderer.attention == "cross" or config.renderer.lookup or sharding.current()
+    most = 1 if target.platform() == "cpu" and not shares else config.renderer.chunk
+    most = min(most, config.frames, frames)
+    return -(-frames // -(-frames // most))  # alike in all windows, the last one nearly full
 
 
 class Known(NamedTuple):
@@ -46,24 +70,34 @@ def encode(
     *,
     scale: float | None = None,
     stage: Stage | None = None,
+    cache: dict[Any, Any] | None = None,
 ) -> tuple[Known, Normalisation]:
     """Photos to scene tokens; `Normalisation.apply` brings cameras into their frame.
 
     near: cameras about where pictures will be asked for, K in pixels of config.height x config.width. They decide the
-      scale only where the photos do not, as of a single one. scale: a divisor of all positions instead.
+      scale only where the photos do not, as of a single one. scale: a divisor of all positions instead. cache: keeps
+      the compiled program for further calls with these parameters and config.
     """
     stage = stage or (lambda name: nullcontext())
+    cache = {} if cache is None else cache
     views, info = of_photos(config, photos, near, scale=scale)
-    with stage("compile"):
-        run = encoder(params, views, config)
+    key = "encode", _shapes(views)
+    if key not in cache:
+        with stage("compile"):
+            cache[key] = encoder(params, views, config)
     with stage("prepare"):
-        return jax.block_until_ready(run(params, views)), info
+        return jax.block_until_ready(cache[key](params, views)), info
+
+
+def _shapes(tree: Any) -> tuple[tuple[int, ...], ...]:
+    return tuple(x.shape for x in jax.tree.leaves(tree))
 
 
 def of_photos(
     config: RoGeConfig, photos: Photos, near: Cameras, *, scale: float | None = None
 ) -> tuple[model.Views, Normalisation]:
     """(the views of the photos alone, the frame that they are in); arguments as of `encode`."""
+    check_makes_pictures(config, f"The model '{config.name}'")
     check_photos(photos, config)
     context, targets, info = normalise(photos.cameras, near, rule=config.scale_rule, scale=scale)
     seen = photos.images, photos.recon, context
@@ -86,16 +120,17 @@ def known_shapes(params: Tree, views: model.Views, config: RoGeConfig) -> Known:
 def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
     full = views.get("full")
     tokens = model.reconstruct(params, views, config=config)
-    return Known(tokens, views if full is None else views | {"full": full.prepared()})
+    if full is None:
+        return Known(tokens, views)
+    match = params["renderer"]["lookup"].get("match")
+    return Known(tokens, views | {"full": depth.prepared(match, full)})
 
 
 def among(known: Known, kept: jax.Array) -> Known:
     """Some of the photos [k] of a scene: what is known of the others is not looked at."""
     views = {name: x[kept] for name, x in known.views.items() if name != "full"}
     if (full := known.views.get("full")) is not None:
-        rows = full.pyramid._replace(first=full.pyramid.first[:, kept])
-        parts = (x[kept] for x in full[:-1])
-        views["full"] = type(full)(*parts, pyramid=rows)
+        views["full"] = full.among(kept)
     return Known(known.tokens[kept], views)
 
 
@@ -122,7 +157,7 @@ def compiled(
     params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None = None
 ) -> Callable:
     """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
-    shapes: list[tuple[tuple[int, ...], Any]] = [((count, n, n), jnp.float32) for n in (3, 4)]
+    shapes: list[Any] = [((count, n, n), jnp.float32) for n in (3, 4)]
     shapes += [] if photos is None else [((photos,), jnp.int32)]
     where = sharding.everywhere()
     cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)
@@ -138,28 +173,38 @@ def preview(
     *,
     scale: float | None = None,
     stage: Stage | None = None,
-    progress: bool = False,
+    progress: bool | Bar = False,
+    cache: dict[Any, Any] | None = None,
 ) -> Result:
     """The reconstruction's picture along `path`, as `frames` and `preview` of a result without evaluations.
 
-    As `sampling.sample`, whose windows all see the photos alone here. `scale`: as of `encode`.
+    As `sampling.sample`, whose windows all see the photos alone here. `scale`: as of `encode`. The scene is encoded once;
+    its pictures come `at_once` and wait for no others.
     """
     from tqdm import tqdm
 
     stage = stage or (lambda name: nullcontext())
+    cache = {} if cache is None else cache
     warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
-    known, info = encode(params, config, photos, path, scale=scale, stage=stage)
+    known, info = encode(params, config, photos, path, scale=scale, stage=stage, cache=cache)
     targets = info.apply(path)
-    runs = windows(len(path), min(config.frames, len(path)))
-    length = runs[0][1]
-    with stage("compile"):
-        run = compiled(params, known, length, config)
-    frames = []
-    for start, stop in tqdm(runs, desc="preview", disable=not progress, dynamic_ncols=True):
+    length = at_once(config, len(path))
+    key = "look", length, _shapes(known)
+    if key not in cache:
+        with stage("compile"):
+            cache[key] = compiled(params, known, length, config)
+    run, frames = cache[key], []
+    bar: Any = progress
+    if isinstance(progress, bool):
+        bar = tqdm(desc="preview", unit="frame", disable=not progress, dynamic_ncols=True)
+    bar.reset(len(path))
+    for start, stop in windows(len(path), length):
         some = pad_path(targets[start:stop], length)
         K, c2w = (np.asarray(x, np.float32) for x in (some.K, some.c2w))
         with stage("preview"):
             frames.append(np.array(run(params, known, K, c2w))[: stop - start])
+        bar.update(stop - start)
+    bar.close()
     made = np.concatenate(frames)
     whole, used = [0, len(path) - 1], list(photos.ids)
     told = {"frames": whole, "photos": used, "generated": [], "rgb_head": [whole]}
@@ -174,11 +219,10 @@ def held_weights(config: RoGeConfig, mesh: sharding.AnyMesh, dtype: str) -> int:
 
 def report(config: RoGeConfig, m: int, *, frames: int, half: bool) -> str:
     """What `--preview-only --dry-run` prints: the parts of `cost.report` that run."""
-    dtype = jnp.bfloat16 if half else jnp.float32
-    whole, size = (
-        cost.estimate(config, m, 0, dtype=dtype),
-        (config.recon_height, config.recon_width),
-    )
+    dtype, size = jnp.bfloat16 if half else jnp.float32, (config.recon_height, config.recon_width)
+    together = at_once(config, frames)
+    chunk = dataclasses.replace(config.renderer, chunk=together)
+    whole = cost.estimate(dataclasses.replace(config, renderer=chunk), m, 0, dtype=dtype)
     rays = frames + (m if config.renderer.refinement == "shared" else 0)
     flops = {
         "reconstruct": cost.encoder(config.encoder, *size, m, config.renderer.width),
@@ -188,6 +232,10 @@ def report(config: RoGeConfig, m: int, *, frames: int, half: bool) -> str:
         "look into photos": cost.lookup(config.renderer, *size, m, frames),
     }
     working = {name: whole.working_bytes[name] for name in STAGES if name in whole.working_bytes}
+    # Ray features of a program's views alone are there at a time, and not those of the photos.
+    waiting = m + config.frames - together
+    rays_each = whole.tokens["ray tokens per view"] - config.renderer.registers
+    working["query rays"] -= 4.0 * waiting * rays_each * config.renderer.width
     weights, output = sum(whole.weights[part] for part in PARTS), config.output_size
     count = sum(cost.weight_bytes(config)[part] for part in PARTS) / 4e6
     peak = weights + max(working.values())

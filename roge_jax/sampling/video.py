@@ -45,6 +45,7 @@ from .windows import (
     woven,
 )
 
+NOTHING_TO_PLAN = "A reconstruction alone has no generator to spare: sample without a plan."
 LONG = ("chain", "independent")
 SLOTS = ("noised", "clean", "free")
 
@@ -178,6 +179,8 @@ def sample(
 ) -> Result:
     """The video along `path` (cameras [n] in the scene's frame, K in pixels of config.height x config.width).
 
+    Of a reconstruction alone it is `reconstruction.preview`; of the settings it takes the scale.
+
     Args:
       stage: called with "compile", "prepare", "sample" and "decode"; a context manager that times (`entry.Clock`).
       plan: what to leave out (`planning.plan`); its steps, solver and schedule replace those of `settings`.
@@ -187,6 +190,15 @@ def sample(
     """
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
+    if config.parts != "all":
+        from . import reconstruction  # it imports this module, and refuses a generator alone
+
+        if plan is not None:
+            raise UserError(NOTHING_TO_PLAN)
+        show = functools.partial(
+            reconstruction.preview, stage=stage, progress=progress, cache=cache
+        )
+        return show(params, config, photos, path, scale=settings.scale)
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
     check_photos(photos, config)
     if plan is not None:

@@ -31,6 +31,7 @@ from .sources import DTYPES, Source
 READABLE = {DTYPES[name] for name in ("F64", "F32", "F16", "BF16")}
 HALF = DTYPES["BF16"]
 PLAN, PROGRESS = "plan.json", "progress"
+LISTED = 20  # kinds of mismatches of a file that an error names
 FLUSH_BYTES = 1_000_000_000  # written between two notes of the progress
 
 
@@ -58,7 +59,9 @@ class Plan(NamedTuple):
     config: RoGeConfig
     specs: dict[str, Spec]  # by path, in the order of writing
     fills: list[Fill]
-    given: dict[str, np.ndarray]
+    given: Mapping[
+        str, np.ndarray | Callable[[], np.ndarray]
+    ]  # a function: made when it is written
     half: bool  # frozen matrices in bfloat16
     provenance: dict[str, Any]
     seed: int = 0
@@ -160,11 +163,16 @@ def report(faults: Iterable[Fault]) -> None:
     files: dict[str, list[str]] = {}
     for (file, pattern, what), numbers in groups.items():
         files.setdefault(file, []).append(f"{pattern.replace('{}', _ranges(numbers))} {what}")
-    listed = " | ".join(f"{file}: {'; '.join(lines)}" for file, lines in files.items())
+    listed = " | ".join(f"{file}: {_shortened(lines)}" for file, lines in files.items())
     count = "1 tensor does" if len(faults) == 1 else f"{len(faults)} tensors do"
     raise UserError(
         f"{count} not fit this model. {listed}. Check that the files are whole and belong to this model (--preset)."
     )
+
+
+def _shortened(lines: list[str]) -> str:
+    more = f"; and {len(lines) - LISTED} kinds more" if len(lines) > LISTED else ""
+    return "; ".join(lines[:LISTED]) + more
 
 
 def _ranges(numbers: list[int]) -> str:
@@ -213,6 +221,7 @@ def write(
     """
     part = check_output(out)
     layout = plan.layout(shard_bytes)
+    plan = plan._replace(given={p: v() if callable(v) else v for p, v in plan.given.items()})
     record = _record(plan, layout)
     done = _resumable(part, record) if resume else 0
     if not done:
@@ -293,7 +302,9 @@ def _record(plan: Plan, layout: Layout) -> dict:
         ],
         "config": json.loads(json.dumps(to_dict(plan.config))),
         "pieces": [[fill.path, fill.layer, fill.key] for fill in plan.fills],
-        "given": {p: hashlib.sha256(v.tobytes()).hexdigest() for p, v in plan.given.items()},
+        "given": {
+            p: hashlib.sha256(np.asarray(v).tobytes()).hexdigest() for p, v in plan.given.items()
+        },
         "dtype": "bfloat16" if plan.half else "float32",
         "seed": plan.seed,
         "sizes": layout.sizes,

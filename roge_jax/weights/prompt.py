@@ -3,7 +3,10 @@
 Rows are those of umT5's last hidden state, cut to the true length of the prompt; the model stores them zero-padded.
 """
 
+import functools
 import math
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +15,70 @@ from ..config import DiTConfig
 from ..core import memory
 from ..errors import UserError
 from ..files.fields import is_file, read_json
-from .sources import open_source
+from . import umt5
+from .sources import Source, open_source
 
+Rows = np.ndarray | Callable[[], np.ndarray]
 WEIGHTS = ("model.safetensors", "model.safetensors.index.json")  # whole, or in shards
 EXTRA = "pip install -e '.[convert]' in the project's folder"
+
+
+def choose_rows(
+    cfg: DiTConfig,
+    text: str,
+    *,
+    embedding: Path | None,
+    encoder: Path | None,
+    beside: Path | None,
+) -> tuple[str, Rows | None]:
+    """(a word on where they come from, the rows [text_len, text_dim] or what makes them) of a prompt; None: zeros.
+
+    embedding: a file with the finished rows. encoder: umT5, as given. beside: the one found with the transformer, which is
+    asked for the empty prompt. Encoders are opened and checked here; nothing but headers is read.
+    """
+    if embedding:
+        return f"read from {embedding.name}", read_prompt(embedding, cfg)
+    if text and encoder:
+        if encoder.is_file():
+            raise UserError(
+                f"--prompt '{text}' needs umT5's tokenizer beside the encoder: give --t5 a diffusers folder (text_encoder, "
+                f"tokenizer); {encoder.name} alone gives the empty prompt."
+            )
+        check_encoder(encoder)
+        return f"umT5 of '{text}'", functools.partial(encode_prompt, encoder, text, cfg)
+    place = encoder or beside
+    if place is None:
+        return "none: all rows are zero", None
+    weights = _weights_of(place)
+    if weights is None:  # no safetensors: pickles, which transformers reads
+        check_encoder(place)
+        return "umT5 of ''", functools.partial(encode_prompt, place, "", cfg)
+    source = open_source(weights)
+    umt5.check(source, cfg)
+    return f"umT5 of '', from {weights.name}", functools.partial(empty_prompt, source, cfg)
+
+
+def _weights_of(path: Path) -> Path | None:
+    """The file or folder of an encoder's weights that `umt5` can read; None if there are no such in a folder."""
+    if not path.is_dir():
+        return path
+    if is_file(path / umt5.FILE):
+        return path / umt5.FILE
+    inner = _places(path)[0]
+    return inner if any(inner.glob("*.safetensors")) else None
+
+
+def empty_prompt(source: Source, cfg: DiTConfig) -> np.ndarray:
+    """[text_len, text_dim] of the empty prompt, with a bar over the encoder's layers."""
+    from tqdm import tqdm
+
+    with tqdm(desc="empty prompt", unit="layer", disable=not sys.stderr.isatty()) as bar:
+
+        def progress(done: int, total: int) -> None:
+            bar.total = total
+            bar.update(done - bar.n)
+
+        return padded(umt5.end_token(source, cfg, progress=progress), cfg, str(source.path))
 
 
 def padded(rows: np.ndarray, cfg: DiTConfig, source: str) -> np.ndarray:

@@ -28,8 +28,9 @@ from ..recon.vggt import encoder_specs
 from ..video.dit import dit_specs
 from ..video.vae import vae_specs
 from . import lagernvs, lora_export, wan_dit, wan_vae
+from .catalogue import BY_NAME, how_to_get, locate, name_of
 from .importer import Fault, Fill, plan_network
-from .sources import Source, open_source
+from .sources import INDEX, Source, open_source
 
 # (name, what a user calls it, keys that only it has), most specific first; prefixes of wrappers are allowed for.
 FAMILIES = (
@@ -79,8 +80,15 @@ def expect(source: Source, allowed: tuple[str, ...], option: str, wanted: str) -
 
 def find_wan(path: Path) -> tuple[Source, Path | None]:
     """(transformer, place of the VAE if it is beside it) of a file, an official folder or a diffusers folder."""
-    path = Path(path)
+    path = locate(path)
     inner = path / "transformer" if (path / "transformer").is_dir() else path
+    beside = sorted(p.name for p in inner.glob("*.pth")) if inner.is_dir() else []
+    if beside and not [*inner.glob("*.safetensors"), *inner.glob(INDEX)]:
+        found = BY_NAME.get(name_of(inner) or "")
+        cure = how_to_get(found) if found else "download it too"
+        raise UserError(
+            f"{path} has {' and '.join(beside)}, but no transformer (diffusion_pytorch_model*.safetensors): {cure}."
+        )
     source = open_source(inner)
     expect(source, ("dit",), "--wan", "a Wan2.1 transformer (T2V or I2V)")
     folder = path if path.is_dir() else path.parent

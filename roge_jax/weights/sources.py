@@ -7,110 +7,29 @@
 Both formats keep every tensor as plain bytes at some place of a file, so one reader serves both: `Stored` is that
 place. A mapping lives as long as the array that `read` returned, so memory holds one tensor, not the file.
 
-PyTorch files are pickles, and a pickle can run any program. The reader here knows the handful of names that tensors
-are made of and refuses everything else; it does not need PyTorch.
+PyTorch files are pickles, which can run any program; `weights.pytorch` reads tensors of them and refuses everything else.
 """
 
-import collections
-import io
 import json
-import math
 import operator
-import pickle
 import re
-import struct
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import ml_dtypes  # comes with JAX
 import numpy as np
 
 from ..errors import UserError
+from .catalogue import BY_NAME, how_to_get, name_of
+from .pytorch import read_torch_header
+from .stored import DTYPES as DTYPES
+from .stored import Stored as Stored
+from .stored import check_content
 
 SAFETENSORS = (".safetensors",)
 TORCH = (".pth", ".pt", ".bin", ".ckpt")
 INDEX = "*.safetensors.index.json"
 HEADER_LIMIT = 100_000_000  # bytes, as in the safetensors library
-WRAPPERS = (
-    "model",
-    "state_dict",
-    "model_state_dict",
-    "module",
-)  # {"model": {key: tensor}, "step": 3}
-
-DTYPES = {
-    "F64": np.dtype(np.float64),
-    "F32": np.dtype(np.float32),
-    "F16": np.dtype(np.float16),
-    "BF16": np.dtype(ml_dtypes.bfloat16),
-    "I64": np.dtype(np.int64),
-    "I32": np.dtype(np.int32),
-    "I16": np.dtype(np.int16),
-    "I8": np.dtype(np.int8),
-    "U64": np.dtype(np.uint64),
-    "U32": np.dtype(np.uint32),
-    "U16": np.dtype(np.uint16),
-    "U8": np.dtype(np.uint8),
-    "BOOL": np.dtype(np.bool_),
-    "F8_E4M3": np.dtype(ml_dtypes.float8_e4m3fn),
-    "F8_E5M2": np.dtype(ml_dtypes.float8_e5m2),
-}
-_TORCH_STORAGES = {
-    "DoubleStorage": "F64",
-    "FloatStorage": "F32",
-    "HalfStorage": "F16",
-    "BFloat16Storage": "BF16",
-    "LongStorage": "I64",
-    "IntStorage": "I32",
-    "ShortStorage": "I16",
-    "CharStorage": "I8",
-    "ByteStorage": "U8",
-    "BoolStorage": "BOOL",
-    "UntypedStorage": "U8",
-}
-_TORCH_DTYPES = {
-    "uint16": "U16",
-    "uint32": "U32",
-    "uint64": "U64",
-    "float8_e4m3fn": "F8_E4M3",
-    "float8_e5m2": "F8_E5M2",
-}
-# Kinds of numbers that no weights here are of: complex, quantised, other floats of 8 bits.
-_OTHER_KINDS = re.compile(r"([A-Z]\w+)Storage|((?:complex|float|bits|quint|qint)\d+\w*)")
-
-
-class Stored(NamedTuple):
-    """Where one tensor is: `shape` elements of `dtype` from byte `offset` of `file`, `strides` elements apart.
-
-    NumPy takes it for an array: `np.asarray(stored)` is `stored.read()`.
-    """
-
-    file: Path
-    offset: int
-    shape: tuple[int, ...]
-    dtype: np.dtype
-    strides: tuple[int, ...] | None = None  # None: contiguous, last axis fastest
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the tensor."""
-        return math.prod(self.shape) * self.dtype.itemsize
-
-    def read(self) -> np.ndarray:
-        """The tensor as it is stored, read-only: its pages come from the file when they are touched."""
-        if not math.prod(self.shape):
-            return np.zeros(self.shape, self.dtype)
-        if self.strides is None:
-            return np.asarray(np.memmap(self.file, self.dtype, "r", self.offset, self.shape))
-        extent = 1 + sum((n - 1) * s for n, s in zip(self.shape, self.strides, strict=True))
-        flat = np.asarray(np.memmap(self.file, self.dtype, "r", self.offset, (extent,)))
-        steps = tuple(s * self.dtype.itemsize for s in self.strides)
-        return np.lib.stride_tricks.as_strided(flat, self.shape, steps, writeable=False)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.read(), dtype, copy=copy)
 
 
 class Source(NamedTuple):
@@ -171,6 +90,7 @@ def read_safetensors_header(file: Path) -> dict[str, Stored]:
     except OSError as error:
         raise UserError(f"{file} cannot be read ({error.strerror}): copy it again.") from None
     with stream as f:
+        check_content(file)
         start = f.read(8)
         length = int.from_bytes(start, "little") if len(start) == 8 else HEADER_LIMIT + 1
         if length > HEADER_LIMIT:
@@ -240,10 +160,25 @@ def _folder(folder: Path) -> dict[str, Stored]:
     torch = sorted(f for f in folder.iterdir() if f.suffix in TORCH)
     if len(torch) == 1:
         return read_torch_header(torch[0])
-    found = ", ".join(f.name for f in torch) or "none"
+    if not torch:
+        raise UserError(f"{folder} holds no weights{_instead(folder)}")
+    found = ", ".join(f.name for f in torch)
     raise UserError(
         f"{folder} holds no safetensors (PyTorch files there: {found}): give the weight file itself."
     )
+
+
+def _instead(folder: Path) -> str:
+    """What a folder has in place of weights, and what to do."""
+    known = BY_NAME.get(name_of(folder) or "")
+    cure = how_to_get(known) if known else "give the folder that the weights were downloaded to"
+    unfinished = (".cache/huggingface/download", "../../blobs")
+    if any(any((folder / place).glob("**/*.incomplete")) for place in unfinished):
+        again = f"`{known.command}`" if known else "the same `hf download` command"
+        return f", because their download was not finished: {again} goes on with it."
+    names = sorted(f.name for f in folder.iterdir() if not f.name.startswith("."))
+    shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    return f" ({f'only {shown}' if names else 'it is empty'}): {cure}."
 
 
 def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:
@@ -252,7 +187,7 @@ def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:
     lost = sorted(set(range(1, count + 1)) - have)
     if lost:
         raise UserError(
-            f"{folder} is incomplete: shard {lost[0]} of {count} is missing ({len(lost)} in all)."
+            f"{folder} is incomplete: shard {lost[0]} of {count} is missing ({len(lost)} in all): download the rest."
         )
     tensors: dict[str, Stored] = {}
     for file in files:
@@ -276,7 +211,7 @@ def _indexed(index: Path) -> dict[str, Stored]:
     lost = [name for name in names if not (index.parent / name).exists()]
     if lost:
         raise UserError(
-            f"{index.parent} is incomplete: {', '.join(lost)} missing ({index.name} lists them)."
+            f"{index.parent} is incomplete: {', '.join(lost)} missing ({index.name} lists them): download the rest."
         )
     tensors: dict[str, Stored] = {}
     for name in names:
@@ -289,150 +224,3 @@ def _indexed(index: Path) -> dict[str, Stored]:
         # Of a tensor in several shards the index says which; one that it does not list is somebody's mistake to report.
         tensors |= {key: place for key, place in shard.items() if files.get(key, name) == name}
     return tensors
-
-
-# ---- PyTorch's zip format ------------------------------------------------------------------------
-
-
-class _Storage(NamedTuple):
-    offset: int
-    dtype: np.dtype
-    elements: int
-
-
-def read_torch_header(file: Path) -> dict[str, Stored]:
-    """{key: place} of a PyTorch file (`torch.save` of version 1.6 or later), without PyTorch and without trust."""
-    try:
-        archive = zipfile.ZipFile(file)
-    except zipfile.BadZipFile:
-        with file.open("rb") as f:
-            cut = f.read(2) == b"PK"
-        what = "is not a PyTorch zip file (saved before version 1.6, or damaged)"
-        what = "is truncated" if cut else what
-        raise UserError(f"{file} {what}: download it again, or save it as safetensors.") from None
-    with archive:
-        names = archive.namelist()
-        pickles = [name for name in names if name.endswith("/data.pkl") and name.count("/") == 1]
-        if len(pickles) != 1:
-            raise UserError(f"{file} is a zip file, but no PyTorch checkpoint: it has no data.pkl.")
-        root = pickles[0].removesuffix("data.pkl")
-        places = {i.filename.removeprefix(root + "data/"): i for i in archive.infolist()}
-        order = f"{root}byteorder"
-        if order in names and archive.read(order) != b"little":
-            raise UserError(
-                f"{file} was written on a big-endian machine: save it again on a usual one."
-            )
-        try:
-            content = _Unpickler(file, archive.read(pickles[0]), places).load()
-        except UserError:
-            raise
-        except Exception as error:  # a damaged pickle can fail in any way
-            raise UserError(
-                f"{file} cannot be read ({type(error).__name__}: {error}): download it again."
-            ) from None
-    tensors = _find_tensors(content)
-    if not tensors:
-        raise UserError(
-            f"{file} holds no tensors by name: give the weights, not the optimiser or a whole module."
-        )
-    return tensors
-
-
-def _find_tensors(content: Any) -> dict[str, Stored]:
-    if not isinstance(content, dict):
-        return {}
-    for name in WRAPPERS:
-        if isinstance(content.get(name), dict):
-            return _find_tensors(content[name])
-    return {key: t for key, t in content.items() if isinstance(key, str) and isinstance(t, Stored)}
-
-
-class _Unpickler(pickle.Unpickler):
-    """Knows how tensors are put together, and nothing else. Names are looked up here, never imported."""
-
-    def __init__(self, file: Path, data: bytes, places: Mapping[str, zipfile.ZipInfo]):
-        super().__init__(io.BytesIO(data))
-        self.file, self.places = file, places
-        self.opened: dict[str, _Storage] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        if module in ("torch", "torch.storage") and name in _TORCH_STORAGES:
-            return _TORCH_STORAGES[name]
-        if module == "torch" and name in _TORCH_DTYPES:
-            return _TORCH_DTYPES[name]
-        known = {
-            ("collections", "OrderedDict"): collections.OrderedDict,
-            ("torch._utils", "_rebuild_tensor_v2"): lambda *args: self._tensor(*args[:4]),
-            ("torch._utils", "_rebuild_tensor_v3"): lambda *args: self._typed(
-                args[0], args[1], args[2], args[3], args[6]
-            ),
-            ("torch._utils", "_rebuild_parameter"): lambda tensor, *_: tensor,
-            ("torch", "Size"): lambda sizes=(): tuple(sizes),
-        }
-        if module in ("torch", "torch.storage") and (kind := _OTHER_KINDS.fullmatch(name)):
-            raise UserError(
-                f"{self.file} has tensors of type {kind[1] or kind[2]}, which cannot be read: save them as float32, bfloat16 or float16."
-            )
-        if (module, name) not in known:
-            raise UserError(
-                f"{self.file} tries to execute code: it asks for '{module}.{name}', which no weights need; "
-                "do not load it anywhere, and take the file from its publisher."
-            )
-        return known[module, name]
-
-    def persistent_load(self, pid: Any) -> _Storage:
-        kind, dtype, key, _, count = pid
-        if kind != "storage" or dtype not in DTYPES:
-            raise ValueError(f"storage {pid!r}")
-        if key not in self.opened:
-            self.opened[key] = self._storage(str(key), DTYPES[dtype], int(count))
-        return self.opened[key]
-
-    def _storage(self, key: str, dtype: np.dtype, count: int) -> _Storage:
-        if key not in self.places:
-            raise UserError(
-                f"{self.file} is incomplete: its storage '{key}' is missing; download it again."
-            )
-        info = self.places[key]
-        if info.compress_type != zipfile.ZIP_STORED:
-            raise UserError(
-                f"{self.file} is compressed, unlike PyTorch's own files: unpack and save it again."
-            )
-        if count * dtype.itemsize > info.file_size:
-            raise UserError(
-                f"{self.file} is damaged: storage '{key}' is shorter than its {count} elements."
-            )
-        with self.file.open(
-            "rb"
-        ) as f:  # bytes begin after the local header: the index lacks its length
-            f.seek(info.header_offset)
-            local = f.read(30)
-        if local[:4] != b"PK\x03\x04":
-            raise UserError(
-                f"{self.file} is damaged: storage '{key}' is not where its index says; download it again."
-            )
-        name, extra = struct.unpack("<HH", local[26:30])
-        return _Storage(info.header_offset + 30 + name + extra, dtype, count)
-
-    def _typed(self, storage: _Storage, start: int, shape, strides, dtype: str) -> Stored:
-        """Kinds of numbers younger than PyTorch's typed storages: their storage counts bytes."""
-        kind = DTYPES[dtype]
-        elements = storage.elements * storage.dtype.itemsize // kind.itemsize
-        return self._tensor(_Storage(storage.offset, kind, elements), start, shape, strides)
-
-    def _tensor(
-        self, storage: _Storage, start: int, shape: tuple[int, ...], strides: tuple[int, ...]
-    ) -> Stored:
-        shape, strides = tuple(map(int, shape)), tuple(map(int, strides))
-        last = sum((n - 1) * s for n, s in zip(shape, strides, strict=True))
-        inside = start >= 0 and min((*shape, *strides), default=0) >= 0
-        if not inside or (0 not in shape and start + last >= storage.elements):
-            raise UserError(
-                f"{self.file} is damaged: a tensor of shape {shape} reaches outside its storage."
-            )
-        contiguous = [1]  # from the last axis on; Python's integers do not overflow
-        for n in shape[:0:-1]:
-            contiguous.insert(0, n * contiguous[0])
-        plain = all(n == 1 or s == c for n, s, c in zip(shape, strides, contiguous))
-        offset = storage.offset + start * storage.dtype.itemsize
-        return Stored(self.file, offset, shape, storage.dtype, None if plain else strides)

@@ -229,7 +229,7 @@ def test_the_thread_serves_two_viewers_and_ends(live, ours):
     assert failed == []
     for who in "ab":
         own = [what for name, what in shown if name == who]
-        assert not own[0].finest and own[-1].finest and own[0].seconds > 0
+        assert own[-1].finest and own[0].seconds > 0  # a fast machine may begin with it
     assert not any(thread.is_alive() for thread in worker.threads)
 
 

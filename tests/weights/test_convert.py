@@ -582,16 +582,58 @@ def test_wrong_family(files, tmp_path):
 
 def test_missing_parts(files, tmp_path):
     wan = files["wan"]
-    fails("Nothing fills encoder, renderer: give --lagernvs", "--wan", wan)
+    half = ["--wan", wan, "--random", "encoder"]
+    fails("Nothing fills renderer: give --lagernvs", *half)
     fails(
         "--random dit, but a file fills it", "--wan", wan, "--random", "dit", "encoder", "renderer"
     )
     fails("--framecrafter holds changes", "--framecrafter", wan)
     fails("does not exist", "--wan", tmp_path / "nowhere.safetensors")
     (tmp_path / "empty").mkdir()
-    fails("holds no safetensors", "--wan", tmp_path / "empty")
+    fails(r"empty holds no weights \(it is empty\): give the folder", "--wan", tmp_path / "empty")
     with pytest.raises(UserError, match="No --out given"):
         run("--wan", wan)
+
+
+POINTER = (
+    "version https://git-lfs.github.com/spec/v1\n"
+    "oid sha256:38071ab59bd94681c686fa51d75a1968f64e470262043be31f7a094e442fd981\nsize 507609880\n"
+)
+
+
+def test_downloads_that_are_not_whole(files, tmp_path):
+    """What lies there in place of weights is named, with the command that gets them."""
+    for name in ("diffusion_pytorch_model.safetensors", "model.pt"):
+        option = "--lagernvs" if name == "model.pt" else "--wan"
+        file = tmp_path / "pointers" / name
+        file.parent.mkdir(exist_ok=True)
+        file.write_text(POINTER)
+        fails(rf"{name} is a Git LFS pointer and not the weights .*`git lfs pull`", option, file)
+        file.write_text("<!DOCTYPE html>\n<html><body>Log in</body></html>" + " " * 100)
+        fails(rf"{name} is a web page and no weights, .*`hf auth login`", option, file)
+    folder = tmp_path / "Wan2.1-T2V-1.3B"
+    folder.mkdir()
+    (folder / "config.json").write_text("{}")
+    command = "hf download Wan-AI/Wan2.1-T2V-1.3B --include config.json "
+    fails(rf"holds no weights \(only config.json\): download it with `{command}", "--wan", folder)
+    unfinished = folder / ".cache/huggingface/download/abc.incomplete"
+    unfinished.parent.mkdir(parents=True)
+    unfinished.write_bytes(b"12")
+    fails(f"download was not finished: `{command}.*` goes on with it", "--wan", folder)
+    made.save_torch(folder / "Wan2.1_VAE.pth", {"a": (2,)}, lambda *_: np.zeros(2))
+    fails(
+        f"has Wan2.1_VAE.pth, but no transformer .*: download it with `{command}", "--wan", folder
+    )
+    lager = tmp_path / "lagernvs_general_512"
+    lager.mkdir()
+    (lager / "README.md").write_text("a card")
+    said = "holds no weights .only README.md.: ask for access on https://huggingface.co/facebook/lagernvs_general_512"
+    fails(said, "--lagernvs", lager)
+    snapshot = tmp_path / "models--facebook--VGGT-1B/snapshots/12"
+    snapshot.mkdir(parents=True)
+    (tmp_path / "models--facebook--VGGT-1B/blobs").mkdir()
+    (tmp_path / "models--facebook--VGGT-1B/blobs/34.incomplete").write_bytes(b"12")
+    fails("download was not finished: `hf download facebook/VGGT-1B", "--vggt", snapshot)
 
 
 def test_missing_shard_and_truncated_file(files, tmp_path):
@@ -727,30 +769,33 @@ def t5_folder(folder: Path, without: str = "") -> Path:
 
 def test_a_text_encoder_that_memory_does_not_hold(files, tmp_path, monkeypatch):
     plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
+    asked = [*plain, "--t5", t5, "--prompt", "a cat"]
     for free, fits in ((4000.0, True), (3999.0, False)):  # 2000 values in bfloat16
         monkeypatch.setattr(memory, "memory_available", lambda free=free: free)
         if fits:
-            run(*plain, "--t5", t5, "--dry-run")
+            run(*asked, "--dry-run")
         else:
-            fails("for the text encoder alone: close other programs", *plain, "--t5", t5)
+            fails("for the text encoder alone: close other programs", *asked)
     (t5 / "text_encoder/model.safetensors").write_bytes(b"cut")
-    fails(r"model\.safetensors is not a safetensors file", *plain, "--t5", t5)
+    fails(r"model\.safetensors is not a safetensors file", *asked)
 
 
 def test_options_of_the_prompt_that_would_be_ignored(files, tmp_path, capsys):
     plain, t5 = everything(files)[:-2], t5_folder(tmp_path / "t5")
-    fails("--prompt 'a cat' needs an encoder", *plain, "--prompt", "a cat")
-    fails("--prompt 'a cat' needs an encoder", *everything(files), "--prompt", "a cat")
+    cat = ["--prompt", "a cat"]
+    fails("--prompt 'a cat' needs an encoder", *plain, *cat)
+    fails("--prompt 'a cat' needs an encoder", *everything(files), *cat)
     fails("both give the prompt: leave one", *everything(files), "--t5", t5)
-    fails("no umT5 encoder and tokenizer there", *plain, "--t5", tmp_path / "nowhere")
+    fails("nowhere does not exist", *plain, "--t5", tmp_path / "nowhere")
+    fails("no umT5 encoder and tokenizer there", *plain, "--t5", tmp_path / "nowhere", *cat)
     for i, lost in enumerate(("config.json", "model.safetensors", "tokenizer.json")):
         name = f"{'tokenizer' if 'tokenizer' in lost else 'text_encoder'}/{lost}"
         part = t5_folder(tmp_path / f"{i}", without=name)
-        fails("no umT5 encoder and tokenizer there", *plain, "--t5", part)
+        fails("no umT5 encoder and tokenizer there", *plain, "--t5", part, *cat)
     (t5 / "text_encoder/config.json").write_text('{"model_type": "bert"}')
-    fails("is of model type bert", *plain, "--t5", t5)
+    fails("is of model type bert", *plain, "--t5", t5, *cat)
     capsys.readouterr()
-    run(*plain, "--t5", t5_folder(tmp_path / "good"), "--prompt", "a cat", "--dry-run")
+    run(*plain, "--t5", t5_folder(tmp_path / "good"), *cat, "--dry-run")
     assert "no prompt embedding" not in capsys.readouterr().out
 
 
