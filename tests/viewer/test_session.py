@@ -283,6 +283,15 @@ def test_a_preview_loads_no_generator(ours):
     assert again.folder.name == "preview-002" and ours.videos() == [run.folder, again.folder]
 
 
+def test_a_reconstruction_alone_makes_previews(ours):
+    given = ours.given
+    alone = dataclasses.replace(given.config, parts="reconstruction")
+    session = Session(dataclasses.replace(given, config=alone))
+    with pytest.raises(UserError, match="make a preview"):
+        session.start(generated=True)
+    assert finish(session, generated=False).state == "done"
+
+
 def test_a_cancelled_video_leaves_nothing(ours, monkeypatch):
     reached, on = threading.Event(), threading.Event()
     real = runs.sampling.sample
