@@ -195,6 +195,8 @@ class Session:
             if self.run is not None and self.run.state == "running":
                 raise UserError("A video is being made: wait for it, or cancel it.")
             given = self.given
+            if generated and given.config.parts == "reconstruction":
+                raise UserError("This model is a reconstruction alone: make a preview.")
             settings = sampling.Settings(steps=steps, seed=seed, scale=given.scale).of(given.config)
             path, of = self.path(), self.route
             count = 0

@@ -19,6 +19,7 @@ from roge_jax.geometry.trajectories import PRESETS, make_path
 from roge_jax.scenes.paths import load_path
 from roge_jax.scenes.scene import load_scene
 from roge_jax.viewer import keyframes, route, runs
+from roge_jax.viewer.levels import Pace
 from roge_jax.viewer.live import Live, View, Worker
 from roge_jax.viewer.route import Route
 from roge_jax.viewer.session import Given, Session
@@ -214,6 +215,7 @@ def test_coverage_is_high_at_a_photo_and_nothing_behind_it(live, ours):
 
 def test_the_thread_serves_two_viewers_and_ends(live, ours):
     shown, failed = [], []
+    live.pace = Pace((None,) * len(live.levels))  # or one moves at the finest level at once
     worker = Worker(live, lambda who, what: shown.append((who, what)), failed.append)
     worker.ask("a", view_of(ours, 0))
     worker.ask("b", view_of(ours, 1))
@@ -279,6 +281,15 @@ def test_a_preview_loads_no_generator(ours):
     assert run.folder.name == "preview-001" and "preview alone" in runs.about(run.folder)
     again = finish(ours, generated=False)
     assert again.folder.name == "preview-002" and ours.videos() == [run.folder, again.folder]
+
+
+def test_a_reconstruction_alone_makes_previews(ours):
+    given = ours.given
+    alone = dataclasses.replace(given.config, parts="reconstruction")
+    session = Session(dataclasses.replace(given, config=alone))
+    with pytest.raises(UserError, match="make a preview"):
+        session.start(generated=True)
+    assert finish(session, generated=False).state == "done"
 
 
 def test_a_cancelled_video_leaves_nothing(ours, monkeypatch):
