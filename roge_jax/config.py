@@ -27,6 +27,7 @@ class EncoderConfig:
     width: int = 1024
     heads: int = 16
     depth: int = 24  # pairs of one frame block and one global block
+    dino_heads: int | None = None  # of DINOv2; None: as many as the others
     dino_depth: int = 24  # 0: a linear patch embedding of RGB and rays instead of DINOv2
     position_grid: int = 37  # side of DINOv2's learned position table
     registers: int = 4
@@ -364,11 +365,12 @@ def from_dict(values: dict, cls=RoGeConfig, *, source: str = "config"):
         if name in built and built[name] <= 0:
             raise UserError(f"{source}: '{name}' is {built[name]}: it must be above 0.")
     made = cls(**built)
-    width, heads = (int(getattr(made, name, 1)) for name in ("width", "heads"))
-    if hasattr(made, "heads") and width % heads:
-        raise UserError(
-            f"{source}: width {width} is not divisible by {heads} heads: correct one of them."
-        )
+    width = int(getattr(made, "width", 1))
+    for heads in (getattr(made, "heads", None), getattr(made, "dino_heads", None)):
+        if heads is not None and (heads < 1 or width % heads):
+            raise UserError(
+                f"{source}: width {width} is not divisible by {heads} heads: correct one of them."
+            )
     if isinstance(made, RoGeConfig):
         return _checked_preview(_checked_features(made, source), source)
     return _checked_vae(made, source) if isinstance(made, VAEConfig) else made

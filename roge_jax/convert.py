@@ -82,6 +82,14 @@ def parser() -> argparse.ArgumentParser:
         help="networks to initialise randomly instead: encoder renderer vae dit",
     )
     p.add_argument(
+        "--heads",
+        nargs="+",
+        default=[],
+        metavar="NETWORK=N",
+        help="heads of dit, encoder, dino or renderer, where the files do not tell and they are not of the released\n"
+        "width (128 channels a head in dit, 64 in the others)",
+    )
+    p.add_argument(
         "--seed", type=number(0), default=0, help="of everything that is initialised (default: 0)"
     )
     p.add_argument("--out", type=Path, help="new model folder")
@@ -156,7 +164,7 @@ def make_plan(args: argparse.Namespace):
     from .core.params import flatten
     from .errors import UserError
     from .model import specs
-    from .weights import catalogue, importer, published, umt5
+    from .weights import catalogue, heads, importer, published, umt5
     from .weights.prompt import choose_rows
     from .weights.sources import open_source
 
@@ -193,7 +201,7 @@ def make_plan(args: argparse.Namespace):
 
     have = {"dit": wan, "vae": vae, "encoder": recon, "renderer": recon}
     parts = _parts(args, have)
-    config = choose_config(args.preset, wan, recon, parts)
+    config = choose_config(args.preset, wan, recon, parts, heads.parse(args.heads))
     if wan is not None:
         filled += published.fill_dit(config.dit, wan, framecrafter)
     if vae is not None:
@@ -235,46 +243,65 @@ def make_plan(args: argparse.Namespace):
     return plan._replace(provenance=provenance), filled
 
 
-def choose_config(name: str | None, wan, recon, parts: Parts = "all"):
-    """The configuration: a preset, that of a model folder, or the sizes found in the files; of `parts` of the model."""
+def choose_config(
+    name: str | None, wan, recon, parts: Parts = "all", given: dict[str, int] | None = None
+):
+    """The configuration: a preset, that of a model folder, or the sizes found in the files; of `parts` of the model.
+
+    `given`: heads of networks whose files do not tell.
+    """
     from . import checkpoint, config
+    from .weights import heads, published
+
+    if name is not None:
+        folder = name not in config.PRESETS and Path(name).is_dir()
+        chosen = checkpoint.load_config(Path(name)) if folder else config.preset(name)
+        chosen = _fitted(chosen, wan, parts)
+    else:
+        chosen = alone(recon) if parts == "reconstruction" else _found(wan, recon, parts)
+    files = {"dit": wan, "encoder": recon, "dino": recon, "renderer": recon}
+    known = {network: file for network, file in files.items() if file is not None}
+    if recon is not None and published.family(recon)[0] == "vggt":
+        del known["renderer"]
+    settled = heads.settle(chosen, known, given or {}, asked=name is not None)
+    if settled != chosen and name is None and parts != "reconstruction":
+        settled = dataclasses.replace(settled, name="custom")
+    return settled
+
+
+def _fitted(chosen, wan, parts: Parts):
+    """A configuration that was asked for, if the transformer is of its size."""
+    from . import config
     from .errors import UserError
     from .weights import published
 
-    if name in config.PRESETS:
-        chosen = config.preset(name)
-    elif name is not None and Path(name).is_dir():
-        chosen = checkpoint.load_config(Path(name))
-    elif name is not None:
-        chosen = config.preset(name)  # raises, with the closest name
-    else:
-        chosen = None
     found = published.dit_config(wan) if wan is not None else None
-    if chosen is not None:
-        if parts == "reconstruction":
-            size = chosen.recon_height, chosen.recon_width
-            chosen = dataclasses.replace(
-                chosen, parts=parts, height=size[0], width=size[1], output=None
-            )
-        if found is not None and (found.width, found.depth) != (chosen.dit.width, chosen.dit.depth):
-            fits = [p for p in config.PRESETS if _same_size(config.preset(p).dit, found)]
-            raise UserError(
-                f"{wan.path} holds a transformer of width {found.width} with {found.depth} blocks, and preset "
-                f"'{chosen.name}' has {chosen.dit.width} and {chosen.dit.depth}: "
-                f"use {'--preset ' + fits[0] if fits else 'no --preset to take the sizes of the file'}."
-            )
-        return dataclasses.replace(chosen, parts=parts)
-    if parts == "reconstruction":
-        return alone(recon)
-    chosen = config.RoGeConfig(parts=parts)
-    if found is not None:
-        dit = dataclasses.replace(found, in_channels=CONDITIONED)
-        same = [p for p in config.PRESETS if config.preset(p).dit == dit]
-        chosen = (
-            dataclasses.replace(config.preset(same[0]), parts=parts)
-            if same
-            else dataclasses.replace(chosen, name="custom", dit=dit)
+    if found is not None and not _same_size(found, chosen.dit):
+        fits = [p for p in config.PRESETS if _same_size(config.preset(p).dit, found)]
+        raise UserError(
+            f"{wan.path} holds a transformer of width {found.width} with {found.depth} blocks, and preset "
+            f"'{chosen.name}' has {chosen.dit.width} and {chosen.dit.depth}: "
+            f"use {'--preset ' + fits[0] if fits else 'no --preset to take the sizes of the file'}."
         )
+    if parts != "reconstruction":
+        return dataclasses.replace(chosen, parts=parts)
+    height, width = chosen.recon_height, chosen.recon_width
+    return dataclasses.replace(chosen, parts=parts, height=height, width=width, output=None)
+
+
+def _found(wan, recon, parts: Parts):
+    """The configuration of the files: a preset, if the transformer is that of one."""
+    from . import config
+    from .weights import published
+
+    chosen = config.RoGeConfig(parts=parts)
+    if wan is not None:
+        dit = dataclasses.replace(published.dit_config(wan), in_channels=CONDITIONED)
+        same = [p for p in config.PRESETS if config.preset(p).dit == dit]
+        if same:
+            chosen = dataclasses.replace(config.preset(same[0]), parts=parts)
+        else:
+            chosen = dataclasses.replace(chosen, name="custom", dit=dit)
     if recon is not None:
         encoder, renderer = published.recon_config(recon)
         renderer = renderer or chosen.renderer

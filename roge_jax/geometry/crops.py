@@ -30,12 +30,13 @@ def shift_K(K: Any, top: float, left: float) -> Any:
 def cover_window(source: tuple[int, int], target: tuple[int, int]) -> Window:
     """(top, left, height, width): the largest centred window with the aspect ratio of `target`.
 
-    Whole pixels; the remaining error of the aspect ratio (below one source pixel) goes into a
-    per-axis scale of K.
+    Whole pixels, truncated as LagerNVS does (which divides in floating point, and so cuts a row of
+    some pictures that have the shape already); the remaining error of the aspect ratio (below one
+    source pixel) goes into a per-axis scale of K.
     """
     height, width = source
-    keep_height = min(height, max(1, round(width * target[0] / target[1])))
-    keep_width = min(width, max(1, round(height * target[1] / target[0])))
+    keep_height = min(height, max(1, width * target[0] // target[1]))
+    keep_width = min(width, max(1, height * target[1] // target[0]))
     return (height - keep_height) // 2, (width - keep_width) // 2, keep_height, keep_width
 
 

@@ -89,6 +89,11 @@ def self_attention(p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None
 # DINOv2 ViT with registers.
 
 
+def dino_heads(cfg: EncoderConfig) -> int:
+    """Heads of DINOv2, which need not be those of the alternating blocks."""
+    return cfg.dino_heads or cfg.heads
+
+
 def dino_specs(cfg: EncoderConfig) -> Tree:
     """Leaves of DINOv2 with registers (the `cfg.dino_depth` blocks in front of the alternating stack)."""
     d, tokens = cfg.width, cfg.position_grid**2 + 1
@@ -99,7 +104,7 @@ def dino_specs(cfg: EncoderConfig) -> Tree:
         "register_tokens": Spec((cfg.registers, d), (None, "embed"), normal(0.02)),
         "mask_token": Spec((d,), ("embed",), normal(0.02)),  # in the official files, never used
         "blocks": stack(
-            block_specs(d, cfg.heads, qk_norm=False, depth=cfg.dino_depth), cfg.dino_depth
+            block_specs(d, dino_heads(cfg), qk_norm=False, depth=cfg.dino_depth), cfg.dino_depth
         ),
         "norm": norm_specs(d),
     }
@@ -126,7 +131,7 @@ def dino(p: Tree, images: jax.Array, *, cfg: EncoderConfig) -> tuple[jax.Array, 
     lead = jnp.concatenate([first[None], p["register_tokens"].astype(jnp.float32)])
     x = jnp.concatenate([jnp.broadcast_to(lead[None], (v, *lead.shape)), tokens], 1)
     out = {"pos_embed": positions, "tokens_in": x}
-    step = jax.checkpoint(lambda x, p: (block(p, x, cfg.heads, eps=DINO_EPS), None))
+    step = jax.checkpoint(lambda x, p: (block(p, x, dino_heads(cfg), eps=DINO_EPS), None))
     x, _ = jax.lax.scan(step, x, p["blocks"])
     out["prenorm"] = x
     x = layer_norm(p["norm"], x, eps=DINO_EPS)

@@ -84,13 +84,33 @@ def patch_embed(p: Tree, x: jax.Array) -> jax.Array:
     return patch_conv(p["patch_embed"], x).reshape(-1, p["patch_embed"]["bias"].shape[0])
 
 
+STEP = 32  # whole timesteps are a * STEP + b, with a, b < STEP
+
+
+def time_wave(timestep: jax.Array, channels: int) -> jax.Array:
+    """[channels]: cosines, then sines of timestep * 10000^(-j / half), as if the angles were float64; 0 <= timestep < 1024.
+
+    In float32 an angle of 1000 is off by 3e-5. So the timestep is cut into a multiple of 32, ones and a rest, all exact:
+    waves of the first two come from tables that float64 made, the angle of the rest is small, and turns multiply.
+    """
+    half = channels // 2
+    omega = 10000.0 ** (-np.arange(half) / half)
+    t = jnp.asarray(timestep, jnp.float32)
+    whole = jnp.clip(jnp.floor(t), 0, STEP**2 - 1)
+    ones, angles = whole.astype(jnp.int32), np.arange(STEP)[:, None] * omega
+    rest = (t - whole) * omega.astype(np.float32)
+    c, s = jnp.cos(rest), jnp.sin(rest)
+    for index, table in ((ones % STEP, angles), (ones // STEP, STEP * angles)):
+        cosine = jnp.asarray(np.cos(table).astype(np.float32))[index]
+        sine = jnp.asarray(np.sin(table).astype(np.float32))[index]
+        c, s = c * cosine - s * sine, c * sine + s * cosine
+    return jnp.concatenate([c, s])
+
+
 def time_embed(p: Tree, timestep: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Timestep 1000 * sigma, a scalar -> e [d] (modulates the head) and e0 [6, d] (modulates every block)."""
     p = p["time_embed"]
-    half = p["fc1"]["kernel"].shape[0] // 2
-    omega = (10000.0 ** (-np.arange(half) / half)).astype(np.float32)
-    angle = jnp.asarray(timestep, jnp.float32) * omega
-    wave = jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])
+    wave = time_wave(timestep, p["fc1"]["kernel"].shape[0])
     e = linear(p["fc2"], jax.nn.silu(linear(p["fc1"], wave)))
     return e, linear(p["proj"], jax.nn.silu(e)).reshape(6, -1)
 

@@ -28,7 +28,7 @@ IGNORED = r"^(camera_head|depth_head|point_head|track_head)\."  # VGGT's heads; 
 BFLOAT16 = (
     "renderer.per_view_register_tokens",
 )  # every other tensor of the released file is float32
-HEAD_DIM = 64  # of every attention in the released networks; shapes do not tell
+HEAD_DIM = 64  # of every attention in the released networks; `weights.heads` knows of others
 
 _SWAP = [3, 4, 5, 0, 1, 2]
 RAY_CONV = Transform(  # OIHW -> HWIO, and [moment, direction] -> [direction, moment]

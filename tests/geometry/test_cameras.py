@@ -73,6 +73,18 @@ def test_lagernvs_numbers(name):
     assert relative(np.roll(rays, 3, axis=-1), moment_first) < 1e-6
 
 
+@pytest.mark.parametrize("size", [(288, 512), (512, 512), (256, 256), (384, 512), (288, 504)])
+def test_crops_truncate_as_lagernvs_does(size):
+    """Photos of all shapes at its own sizes; 479 pixels to 4:7 keep 273 rows, where rounding keeps 274."""
+    assert cover_window((853, 479), (288, 504))[2:] == (273, 479)
+    ratio = size[0] / size[1]
+    for height in range(90, 1000, 7):
+        for width in (480, 500, 640, 641, 720, 853, 960, 1280, 1920):
+            wide = ratio <= height / width  # their rule, in their floating point
+            want = (int(width * ratio), width) if wide else (height, int(height / ratio))
+            assert cover_window((height, width), size)[2:] == want, (height, width)
+
+
 @pytest.mark.parametrize("index", range(3))
 def test_lagernvs_crops(index):
     """Size of the centre crop and the intrinsics after it."""

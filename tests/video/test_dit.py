@@ -96,6 +96,20 @@ def test_equals_the_published_network(name):
     errors = {key: rel_l2(found[key], value) for key, value in expected.items()}
     print(name, {key: f"{value:.1e}" for key, value in errors.items()})
     assert all(value <= TOLERANCE for value in errors.values()), errors
+    assert errors["mid.e"] < 2e-6 and errors["mid.e0"] < 2e-6  # angles in float32 give 6e-6
+
+
+def test_angles_of_the_timestep_are_those_of_float64():
+    """At every whole timestep and between them; float32 alone would be off by 6e-5. The slope is that of the wave."""
+    t = np.concatenate([np.arange(1001), 1000 * np.random.default_rng(0).random(500)])
+    t = t.astype(np.float32)
+    omega = 10000.0 ** (-np.arange(128) / 128)
+    angle = t.astype(np.float64)[:, None] * omega
+    want = np.concatenate([np.cos(angle), np.sin(angle)], 1)
+    made = jax.jit(jax.vmap(lambda t: net.time_wave(t, 256)))(t)
+    assert np.abs(made - want).max() < 3e-7
+    slope = jax.jit(jax.vmap(jax.grad(lambda t: net.time_wave(t, 256)[3])))(t[-9:])
+    np.testing.assert_allclose(slope, -omega[3] * np.sin(angle[-9:, 3]), atol=1e-6)
 
 
 def random_params(cfg, seed=0):
