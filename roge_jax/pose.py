@@ -5,7 +5,7 @@
     python -m roge_jax.sample --scene myscene                then the video along a path
 
 OUT gets images/ (lens distortion removed), transforms.json, points.ply, sparse/0 (a COLMAP model of images/), cameras.png
-and run.json. It needs the extra `pose`: pip install 'roge_jax[pose]'. docs/howto/pose.md says what to do when it fails.
+and pose.json (numbers of the run). It needs the extra `pose`: pip install 'roge_jax[pose]'. docs/howto/pose.md says what to do when it fails.
 """
 
 import argparse
@@ -85,15 +85,15 @@ def main(args: argparse.Namespace) -> None:
             with Bar() as bar:
                 write_scene(folder, work, shots, names, found, bar)
         shutil.rmtree(work)
-        report = [_summary(found, len(shots))]
-        write_json(folder / "run.json", _record(args, version, shots, names, found, clock))
-    for line in report:
-        print(line)
+        write_json(folder / "pose.json", _record(args, version, shots, names, found, clock))
+    print(_summary(found, len(shots)))
     for note in scene["notes"]:
         warnings.warn(note, stacklevel=2)
     stages = ", ".join(f"{k} {v['seconds']:.0f} s" for k, v in clock.record().items())
     print(stages)
-    print(f"wrote {args.out}/ (images, transforms.json, points.ply, sparse/0, cameras.png, run.json)")
+    print(
+        f"wrote {args.out}/ (images, transforms.json, points.ply, sparse/0, cameras.png, pose.json)"
+    )
     print(f"next: python -m roge_jax.sample --scene {args.out} --out outputs/{Path(args.out).name}")
 
 

@@ -53,16 +53,19 @@ def solve(folder: Path, job: Job, progress: Progress) -> dict[str, Any]:
     lines: queue.Queue[str | None] = queue.Queue()
     package = Path(__file__).resolve().parents[2]
     paths = os.pathsep.join(filter(None, [str(package), os.environ.get("PYTHONPATH")]))
-    with (folder / "log.txt").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-P", "-m", f"{__package__}.mapper", str(folder)],
+    command = [sys.executable, "-P", "-m", f"{__package__}.mapper", str(folder)]
+    with (
+        (folder / "log.txt").open("wb") as log,
+        subprocess.Popen(
+            command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=log,
             text=True,
             env=os.environ | {"PYTHONPATH": paths},
             start_new_session=True,  # Ctrl-C is this process's business
-        )
+        ) as process,
+    ):
 
         def listen() -> None:
             assert process.stdout is not None
@@ -70,22 +73,19 @@ def solve(folder: Path, job: Job, progress: Progress) -> dict[str, Any]:
                 lines.put(line)
             lines.put(None)
 
-        threading.Thread(target=listen, daemon=True).start()
+        listener = threading.Thread(target=listen, daemon=True)
+        listener.start()
         try:
             _follow(lines, folder, progress)
             code = process.wait()
         finally:
             process.kill()
-            process.wait()
-            assert process.stdin is not None
-            process.stdin.close()
+            listener.join()
     if code:
         _check_room(folder)
-        raise UserError(f"pycolmap stopped ({_last_words(folder / 'log.txt', code)}): {_REMEDY}")
+        said = _last_words(folder / "log.txt", code)
+        raise UserError(f"pycolmap stopped ({said}): try fewer photos or a smaller --size.")
     return json.loads((folder / "found.json").read_text())
-
-
-_REMEDY = "try fewer photos or a smaller --size; --debug shows where it happened"
 
 
 def _follow(lines: "queue.Queue[str | None]", folder: Path, progress: Progress) -> None:

@@ -57,7 +57,9 @@ def notes(
     out = [i for i in range(count) if i not in kept]
     said = []
     if out:
-        said.append(f"{len(out)} of {count} photos have no pose and are left out: {_named(out, names)}")
+        said.append(
+            f"{len(out)} of {count} photos have no pose and are left out: {_named(out, names)}"
+        )
     soft = [i for i in out if sharpness[i] < BLURRED]
     plain = [i for i in out if i not in soft and found["features"][i] < FEW_FEATURES]
     alone = [i for i in out if i not in soft + plain and not found["partners"][i]]
@@ -75,7 +77,9 @@ def notes(
             "written: take photos in between that show both sides, or pose the parts one by one"
         )
     if out and not thorough:
-        said.append("--thorough looks for more features, several times as long, and may join what is left out")
+        said.append(
+            "--thorough looks for more features, several times as long, and may join what is left out"
+        )
     if found.get("focal_held"):
         said.append(
             "the focal length is EXIF's: the photos alone do not show it (a flat scene, seen from one direction)"

@@ -29,7 +29,7 @@ UPSCALED = 1000  # pixels of the long side below which features are looked for a
 LEAST_MATCHES = 15  # of a pair, after geometry has spoken; COLMAP's own number
 DRIFT = 0.15  # of a focal length away from EXIF's: then it was not seen in the photos
 WORSE = 1.15  # times the reprojection error that EXIF's focal length may cost
-LENS_FROM = 8  # photos of a camera from which its lens gets a second coefficient
+LENS = "SIMPLE_RADIAL"  # one coefficient: what phones and cameras leave of their distortion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,9 +120,9 @@ class Work:
         """The camera that photos share, as it is before anything is known of it but EXIF's focal length."""
         height, width = self.job.copies[group[0]]
         focal = self.job.focals[group[0]]
-        model = "RADIAL" if len(group) >= LENS_FROM else "SIMPLE_RADIAL"
         prior = focal or NO_PRIOR * max(height, width)
-        camera = self.colmap.Camera.create_from_model_name(0, model, prior, width, height)
+        # A second coefficient bends the first small models of long lenses beyond repair.
+        camera = self.colmap.Camera.create_from_model_name(0, LENS, prior, width, height)
         camera.has_prior_focal_length = focal is not None
         return camera
 

@@ -15,7 +15,10 @@ from ..scenes.colmap import make_camera
 from ..scenes.lens import Lens, distorted, straighten
 from ..scenes.matching import epipolar_distances
 
-FITS = 3.0, 0.003  # pixels, and part of the long side: a pair's median distance from its epipolar lines
+FITS = (
+    3.0,
+    0.003,
+)  # pixels, and part of the long side: a pair's median distance from its epipolar lines
 SHARED = 15  # points that two photos both see, for one to hold the other
 SAMPLE = 300  # matches of a pair that are looked at
 BENT = 0.5  # pixels in the corner: less distortion than that is none
@@ -166,7 +169,7 @@ def finish(model: Any, ids: Sequence[int], job: Any) -> dict[str, dict[str, Any]
 
 def _straight_camera(camera: Any, full: tuple[int, int]) -> dict[str, Any]:
     """The full photo's camera and the straightened one's, from that of the small picture."""
-    parameters = np.array(camera.params)
+    parameters, full = np.array(camera.params), (int(full[0]), int(full[1]))
     K, size, lens = make_camera(
         camera.model.name, parameters, camera.width, camera.height, "the camera found"
     )
@@ -212,9 +215,7 @@ def _stand_up(model: Any, images: Sequence[Any]) -> None:
     R = np.stack([across, np.cross(up, across), up])
     depths, points = [], [np.zeros(3)]
     for image, pose in zip(images, c2w, strict=True):
-        seen = [
-            model.point3D(p.point3D_id).xyz for p in image.points2D if p.has_point3D()
-        ]
+        seen = [model.point3D(p.point3D_id).xyz for p in image.points2D if p.has_point3D()]
         if seen:
             depths += ((np.array(seen) - pose[:3, 3]) @ pose[:3, 2]).tolist()
     if model.num_points3D():

@@ -7,7 +7,7 @@ import numpy as np
 ALL = 50  # photos up to which every pair is matched
 BESIDE = 10  # neighbours of a video's frame on either side
 ALIKE = 20  # photos that each of many is matched with
-LOOPS = 5  # photos that a frame of a video is matched with besides, since a walk may come back
+LOOPS = 10  # that a frame of a video is matched with besides, since a walk may come back
 WAYS = ("auto", "exhaustive", "sequential", "retrieval")
 WORDS, SAMPLE = 64, 200  # of the vocabulary, and features of a photo that it is made from
 
@@ -33,10 +33,14 @@ def choose_pairs(count: int, way: str, alike: Callable[[], np.ndarray]) -> list[
     gaps = {*range(1, reach + 1), *(2**k for k in range(7) if way == "sequential")}
     for i in range(count):
         pairs |= {(i, i + gap) for gap in gaps if i + gap < count}
-    likeness = alike() - 2.0 * np.eye(count)
-    for i, row in enumerate(likeness):
+    # Of a video the likest frames are the neighbours, which are pairs already: what is asked for are places seen again.
+    known = np.eye(count, dtype=bool)
+    if way == "sequential":
+        known[tuple(np.array(sorted(pairs)).T)] = True
+    similar = np.where(known | known.T, -np.inf, alike())
+    for i, row in enumerate(similar):
         nearest = np.argsort(-row, kind="stable")[: LOOPS if way == "sequential" else ALIKE]
-        pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest if int(j) != i}
+        pairs |= {(min(i, int(j)), max(i, int(j))) for j in nearest if np.isfinite(row[j])}
     return sorted(pairs)
 
 

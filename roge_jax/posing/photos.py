@@ -138,5 +138,3 @@ def scene_names(files: list[Path], endings: list[str]) -> list[str]:
         taken.add(name.casefold())
         names.append(name)
     return names
-
-

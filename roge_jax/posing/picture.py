@@ -22,9 +22,7 @@ def draw_cameras(cameras: Cameras, xyz: np.ndarray, rgb: np.ndarray | None) -> n
     size = float(max(high - low)) or 1.0
     middle = (low + high) / 2
     views = {"from above (x right, y up)": (0, 1), "from the side (x right, z up)": (0, 2)}
-    sheet = Image.new(
-        "RGB", (2 * PANEL + 3 * MARGIN, PANEL + HEAD + 2 * MARGIN), (255, 255, 255)
-    )
+    sheet = Image.new("RGB", (2 * PANEL + 3 * MARGIN, PANEL + HEAD + 2 * MARGIN), (255, 255, 255))
     font = ImageFont.load_default(size=16)
     colours = _ramp(len(centres))
     for k, (title, axes) in enumerate(views.items()):

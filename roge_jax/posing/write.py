@@ -46,7 +46,7 @@ def write_scene(
     found: dict[str, Any],
     progress: Callable[[str, int, int], None],
 ) -> None:
-    """Everything of the scene but run.json into `folder`; `work` has the model that `mapper` made."""
+    """Everything of the scene but pose.json into `folder`; `work` has the model that `mapper` made."""
     (folder / "images").mkdir()
     done, total = 0, len(found["registered"])
     for camera in found["cameras"].values():
@@ -96,5 +96,3 @@ def room_for(shots: Sequence[Shot], copies: int, pairs: int) -> float:
     """Bytes that a run needs: small pictures of `copies` pixels each, features, matches, and the scene's photos."""
     written = sum(max(ROOM * s.size[0] * s.size[1], s.file.stat().st_size) for s in shots)
     return written + len(shots) * (copies + 8192 * 160) + pairs * 16e3
-
-

@@ -81,7 +81,9 @@ def read_points3D(model: Path, addresses: Sequence[str]) -> Points:
     view_of = {name: view for view, name in enumerate(addresses)}
     views = {image: view_of[name] for image, name in names.items() if name in view_of}
     xyz, rgb, point, image = [], [], [], []
-    for i, (place, colour, track) in enumerate(_binary(file) if file.suffix == ".bin" else _text(file)):
+    for i, (place, colour, track) in enumerate(
+        _binary(file) if file.suffix == ".bin" else _text(file)
+    ):
         xyz.append(place)
         rgb.append(colour)
         point += [i] * len(track)
@@ -120,7 +122,9 @@ def _text(file: Path) -> Iterator[tuple[Any, Any, list[int]]]:
         except ValueError:
             place = []
         if len(place) != 3 or len(colour) != 3:
-            raise UserError(f"{file}, line {number}: expected 'id X Y Z R G B error (image point) ..'.")
+            raise UserError(
+                f"{file}, line {number}: expected 'id X Y Z R G B error (image point) ..'."
+            )
         yield place, colour, track
 
 

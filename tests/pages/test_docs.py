@@ -10,14 +10,18 @@ from types import SimpleNamespace
 
 import pytest
 
-from roge_jax import check, convert, evaluate, export, sample, train
+from roge_jax import check, convert, evaluate, export, pose, sample, train
 from roge_jax.data import pack
 from roge_jax.files import entry
 from roge_jax.procedural import __main__ as procedural_program
 from roge_jax.procedural import scenes as procedural
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs" / "howto").glob("*.md")),
+]
 PARSERS = {
     "check": check,
     "sample": sample,
@@ -25,6 +29,7 @@ PARSERS = {
     "evaluate": evaluate,
     "convert": convert,
     "export": export,
+    "pose": pose,
 }
 
 
@@ -109,6 +114,7 @@ def options(parser: argparse.ArgumentParser) -> list[str]:
         (convert, ["weights"]),
         (export, ["weights"]),
         (check, ["own_photos"]),
+        (pose, ["howto/pose"]),
         (pack, ["own_photos"]),
         (procedural_program, ["figures"]),  # python -m roge_jax.procedural
     ],
@@ -160,7 +166,11 @@ def test_every_chart_and_experiment_can_be_made_again():
 
 def test_every_page_is_listed_in_the_readme():
     text = (ROOT / "README.md").read_text()
-    missing = [page.name for page in PAGES[1:] if f"docs/{page.name}" not in text]
+    missing = [
+        page.name
+        for page in PAGES[1:]
+        if page.parent.name == "docs" and f"docs/{page.name}" not in text
+    ]
     assert not missing, missing
 
 
