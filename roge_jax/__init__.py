@@ -45,6 +45,7 @@ _MODULES = (
     "files",
     "metrics",
     "planning",
+    "posing",
     "training",
     "weights",
 )

@@ -29,6 +29,7 @@ ALLOWED = {
     "procedural": _BASE,
     "scenes": _BASE | {"procedural"},
     "data": _BASE | {"procedural", "scenes"},  # neither networks nor metrics
+    "posing": _BASE | {"scenes"},
     "metrics": _BASE,
     "checkpoint": _PARTS | {"model", "weights"},
     "cost": _PARTS | {"model"},
@@ -39,7 +40,7 @@ ALLOWED = {
     | {"model", "preview", "weights", "procedural", "data", "metrics", "checkpoint", "cost"},
 }
 # Programs may import anything but other programs; a room's own program is its `__main__`.
-PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check", "view"}
+PROGRAMS = {"train", "sample", "evaluate", "convert", "export", "check", "view", "pose"}
 LIGHT = {
     "jax",
     "ml_dtypes",

@@ -49,11 +49,14 @@ def model_config(args: argparse.Namespace, *, weights: bool):
     return config.for_pictures(height, width)
 
 
-def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = False, start=None):
+def camera_path(
+    args: argparse.Namespace, context, config, *, quiet: bool = False, start=None, depth=None
+):
     """The cameras [n] of --trajectory in the scene's frame, K in pixels of the video; --fps where only the file says it.
 
     quiet: what is to be said about the file has been said. start: the pose [4, 4] of the photo at which a path starts
-    that is relative to its first camera; the first of `context` if None.
+    that is relative to its first camera; the first of `context` if None. depth: how far away what a photo of `context`
+    sees is, by its number, or None; a preset takes it for its focus where the user gives none.
     """
     from ..geometry.cameras import Cameras
     from ..geometry.trajectories import PRESETS, make_path, parse_options
@@ -98,9 +101,10 @@ def camera_path(args: argparse.Namespace, context, config, *, quiet: bool = Fals
             raise UserError(
                 f"--path-frame {args.path_frame} is for path files: a preset is in the scene's coordinates; leave it away."
             )
-        path = make_path(
-            name, context, args.frames or config.frames, **({"start": args.start} | options)
-        )
+        options = {"start": args.start} | options
+        if depth is not None and "focus" not in options and options["start"] in range(len(context)):
+            options["focus"] = depth(options["start"])
+        path = make_path(name, context, args.frames or config.frames, **options)
     if args.fov is not None:
         if not args.fov < 180:
             raise UserError(
@@ -214,7 +218,14 @@ def read_inputs(args: argparse.Namespace, config, settings, scene=None):
         known = camera_path(args, every, config, start=start)
         check_sees(args, every, known, config)
     photos = read_photos(scene, context_ids(chosen, scene, config, known), config)
-    path = camera_path(args, photos.cameras, config, quiet=known is not None, start=start)
+    path = camera_path(
+        args,
+        photos.cameras,
+        config,
+        quiet=known is not None,
+        start=start,
+        depth=lambda place: scene.depth(photos.ids[place]),
+    )
     normalise(photos.cameras, path, rule=config.scale_rule, scale=settings.scale)
     noise_levels(settings, config)
     return scene, photos, path

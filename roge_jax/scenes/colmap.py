@@ -1,6 +1,7 @@
-"""COLMAP models, text and binary: where they lie, their cameras and images, without the points."""
+"""COLMAP models, text and binary: where they lie, their cameras and images (`points` reads the points)."""
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,15 @@ def read_model(model: Path) -> list[tuple[str, Camera, np.ndarray]]:
         w2c[:3, :3], w2c[:3, 3] = rotation(np.roll(q_wxyz, -1)), t
         found.append((name, cameras[camera_id], invert(w2c)))
     return found
+
+
+def image_names(model: Path) -> dict[int, str]:
+    """The names of a model's registered photos by COLMAP's numbers."""
+    file = model / "images.bin"
+    if not (file.is_file() and (model / "cameras.bin").is_file()):
+        lines = (text.split(None, 9) for _, text in _image_lines(model))
+        return {int(words[0]): words[9] for words in lines}
+    return {number: name for number, name, *_ in _images_bin(file)}
 
 
 def make_camera(model: str, parameters: np.ndarray, width: int, height: int, where: str) -> Camera:
@@ -245,16 +255,21 @@ def _read_bin(model: Path) -> tuple[dict[int, Camera], list]:
             cameras[camera_id] = _sized_camera(name, parameters, width, height, str(file))
             at += 24 + 8 * count
         file = model / "images.bin"
-        data, at = file.read_bytes(), 8
-        for _ in range(struct.unpack_from("<Q", data)[0]):
-            *numbers, camera_id = struct.unpack_from("<4d3di", data, at + 4)
-            end = data.index(b"\0", at + 64)
-            name = data[at + 64 : end].decode("utf-8", "surrogateescape")
-            points = struct.unpack_from("<Q", data, end + 1)[0]
-            at = end + 9 + 24 * points
-            poses.append((name, camera_id, np.array(numbers[:4]), np.array(numbers[4:])))
+        poses += [pose for _, *pose in _images_bin(file)]
     except UserError:
         raise
     except (struct.error, ValueError) as error:
         raise UserError(f"{file}: damaged or truncated COLMAP file ({error}).") from None
     return cameras, poses
+
+
+def _images_bin(file: Path) -> Iterator[tuple[int, str, int, np.ndarray, np.ndarray]]:
+    """(number, name, camera, quaternion w x y z, translation) of every image of an images.bin."""
+    data, at = file.read_bytes(), 8
+    for _ in range(struct.unpack_from("<Q", data)[0]):
+        image, *numbers, camera_id = struct.unpack_from("<I4d3di", data, at)
+        end = data.index(b"\0", at + 64)
+        name = data[at + 64 : end].decode("utf-8", "surrogateescape")
+        points = struct.unpack_from("<Q", data, end + 1)[0]
+        at = end + 9 + 24 * points
+        yield image, name, camera_id, np.array(numbers[:4]), np.array(numbers[4:])

@@ -8,6 +8,7 @@ import numpy as np
 from roge_jax.geometry.cameras import to_opencv
 from roge_jax.geometry.validation import Finding
 from roge_jax.scenes.lens import Lens
+from roge_jax.scenes.points import Source
 
 NORMALISED = (1, 1)  # the size of a K that is divided by width and height
 
@@ -43,6 +44,7 @@ class Reading:
     frame: whose coordinates these are: "scene", "nerfstudio" (the normalised ones of its viewer), "first" (relative to
     the first camera) or "unknown". times: of key frames to be joined; count: how many frames they make.
     axes: the convention the poses were read in where the layout leaves it open, else "".
+    points: what reads the sparse points that lie beside the poses, if there are any.
     """
 
     source: Path
@@ -58,6 +60,7 @@ class Reading:
     axes: str = ""
     dropped: list[Path] = dataclasses.field(default_factory=list)  # photos left out with a note
     registered: str = "have a pose"
+    points: Source | None = None
 
     def note(self, what: str, fix: str, severity: str = "warning") -> None:
         """One finding about this place."""

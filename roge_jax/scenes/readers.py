@@ -6,16 +6,17 @@ TUM, KITTI odometry, FrameCrafter's npz. As a path: all of these, trajectories a
 `formats.json_paths`.
 """
 
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
 from roge_jax.errors import UserError, did_you_mean
 from roge_jax.files.fields import number, read_json, read_text
 from roge_jax.geometry.cameras import CONVENTIONS
-from roge_jax.scenes.colmap import holds_model
+from roge_jax.scenes.colmap import find_models, holds_model
 from roge_jax.scenes.formats import arrays, colmap, folders, json_paths, nerfstudio, trajectories
 from roge_jax.scenes.frames import Frame, Reading
-from roge_jax.scenes.pictures import is_photo, is_picture, visible
+from roge_jax.scenes.pictures import PHOTO_FOLDERS, is_photo, is_picture, visible
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v")
 LAYOUTS = (
@@ -30,7 +31,7 @@ LAYOUTS = (
     "a RealEstate10K .txt with a folder of frames",
 )
 INNER = ("nerfstudio", "gaussian_splat", "exported", "dslr", "colmap", "dense")
-POSE_THEM = "photos without poses: docs/start/own_photos.md says how to pose them (COLMAP, or ns-process-data)"
+POSE = "python -m roge_jax.pose {} --out {}"
 
 
 def read_frames(path: Path, *, convention: str | None = None, camera: int = 0) -> list[Frame]:
@@ -245,12 +246,9 @@ def _binary(file: Path) -> str:
     """What a file is that is no text, and what to do; "" for text."""
     ending = file.suffix.lower()
     if is_picture(file):
-        return f"is one photo; a scene is a folder of them with poses. Of {POSE_THEM}."
+        return f"is one photo; a scene is a folder of them with poses, which {pose_command(file.parent)} finds."
     if ending in VIDEOS:
-        return (
-            "is a video: take photos out of it (ffmpeg -i VIDEO -vf fps=2 images/%04d.jpg), they are then "
-            f"{POSE_THEM}."
-        )
+        return f"is a video, a scene has photos with poses: {pose_command(file)} makes one of it."
     with file.open("rb") as stream:
         start = stream.read(4096)
     if ending in (".torch", ".pt", ".pth", ".ckpt"):
@@ -262,18 +260,30 @@ def _binary(file: Path) -> str:
     return ""
 
 
+def pose_command(place: Path) -> str:
+    """What finds the poses of a folder of photos or of a video, as a shell takes it."""
+    scene = place.resolve().with_suffix("") if place.is_file() else place.resolve()
+    scene = scene.parent if scene.name in PHOTO_FOLDERS and len(scene.parts) > 2 else scene
+    return POSE.format(shlex.quote(str(place)), shlex.quote(f"{scene.name}_scene"))
+
+
 def _what_folder(folder: Path) -> str:
     """What lies in a folder that is no scene, and what to do."""
-    needs = f"need one of {'; '.join(LAYOUTS)}"
-    here = [f for f in visible(folder, "*") if is_picture(f)]
-    below = [f for f in visible(folder, "*/*") if is_picture(f)]
+    needs = f"has one of {'; '.join(LAYOUTS)}"
+    here = [f for f in visible(folder, "*") if is_photo(f)]
+    below = [f for f in visible(folder, "*/*") if is_photo(f)]
     if here or below:
-        count = len(here) or len(below)
         where = folder if here else below[0].parent
-        return f"no known layout in this folder, {count} {POSE_THEM}; {where} has no poses beside it. {needs[:1].upper()}{needs[1:]}."
+        photos = sum(f.parent == where for f in (here or below))
+        one = "1 photo" if photos == 1 else f"{photos} photos"
+        beside = "" if where == folder else f" in {where}"
+        above = folder.resolve().parent
+        if transforms_of(above) or find_models(above):
+            return f"{one} without poses, which lie beside this folder: give {above}."
+        return f"{one} without poses{beside}: {pose_command(where)} finds them. A scene with poses {needs}."
     if videos := [f for f in visible(folder, "*") if f.suffix.lower() in VIDEOS]:
-        return f"no known layout in this folder, but a video ({videos[0].name}): take photos out of it, then pose them (docs/start/own_photos.md); {needs}."
-    return f"no known layout in this folder: {needs}."
+        return f"no photos in this folder, but a video: {pose_command(videos[0])} makes a scene of it. A scene {needs}."
+    return f"no known layout in this folder: a scene {needs}."
 
 
 def read_split(folder: Path, context: int) -> tuple[list[int], list[int]]:

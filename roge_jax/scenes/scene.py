@@ -1,8 +1,9 @@
 """A scene: posed photographs, from a folder or built in, ready for the model."""
 
 import dataclasses
+import functools
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from roge_jax.geometry.validation import Finding
 from roge_jax.scenes.assemble import pose_frame
 from roge_jax.scenes.frames import Reading
 from roge_jax.scenes.images import Photos
+from roge_jax.scenes.points import Points, depth_of
 from roge_jax.scenes.readers import read_scene, transforms_of
 
 __all__ = [
@@ -43,7 +45,8 @@ class Scene:
     images: a sequence of float32 RGB [h, w, 3] in [0, 1], decoded on access when they are files;
       sizes may differ. depths: z-depth [h, w] per view in the scene's unit where it is known, NaN
       where it is not. notes: what reading changed, assumed or left out, as findings. axes: the convention the poses were
-      read in where the layout leaves it open.
+      read in where the layout leaves it open. cloud: what reads the sparse points that lie beside the poses; `points`
+      are these, in the scene's frame and unit.
     """
 
     images: Sequence[np.ndarray]
@@ -53,9 +56,26 @@ class Scene:
     depths: Sequence[np.ndarray] | None = None
     notes: tuple[Finding, ...] = ()
     axes: str = ""
+    cloud: Callable[[], Points] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @functools.cached_property
+    def points(self) -> Points | None:
+        """The sparse points, read on first use; None where there are none, or (with a warning) none that can be read."""
+        try:
+            return None if self.cloud is None else self.cloud()
+        except (UserError, OSError) as error:
+            told = f"the sparse points are not used: {error}"
+            warnings.warn(told, CameraWarning, stacklevel=2)
+            return None
+
+    def depth(self, view: int) -> float | None:
+        """The median distance along its axis of the points that a view sees; None where too few are known."""
+        if self.points is None:
+            return None
+        return depth_of(self.points, to_host(self.cameras), view, self.sizes[view])
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
@@ -140,10 +160,12 @@ def _assemble(reading: Reading, source: str, exif: str, background: float) -> Sc
         notes.setdefault(note.what, note)
     cameras = Cameras(np.stack([one.K for one in posed]), np.stack([one.c2w for one in posed]))
     photos = Photos([one.photo for one in posed if one.photo is not None])
-    names = _names([frame.address() for frame in reading.frames], [f.file for f in reading.frames])
+    addresses = [frame.address() for frame in reading.frames]
+    names = _names(addresses, [f.file for f in reading.frames])
     told = [dataclasses.replace(note, where=source) for note in reading.notes]
     everything = (*told, *notes.values())
-    return Scene(photos, cameras, names, source, notes=everything, axes=reading.axes)
+    cloud = None if reading.points is None else functools.partial(reading.points, addresses)
+    return Scene(photos, cameras, names, source, notes=everything, axes=reading.axes, cloud=cloud)
 
 
 def _names(addresses: list[str], files: list[Path | None]) -> tuple[str, ...]:

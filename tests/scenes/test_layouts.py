@@ -494,8 +494,12 @@ def test_realestate10k_with_padded_times(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.jpg", b"\xff\xd8\xff", "is one photo; a scene is a folder"),
-        ("a.mp4", b"\0\0\0\x18ftypmp42", "is a video: take photos out of it"),
+        ("a.jpg", b"\xff\xd8\xff", r"is one photo; a scene is a folder .* roge_jax.pose"),
+        (
+            "a.mp4",
+            b"\0\0\0\x18ftypmp42",
+            r"is a video.*roge_jax.pose \S*a.mp4 --out a_scene makes one of it",
+        ),
         ("a.torch", b"PK\x03\x04\0", "is a PyTorch file"),
         ("a.zip", b"PK\x03\x04\0", "is an archive: unpack it"),
         ("a.dat", b"\0\1\2", "is a binary file of no known kind"),
@@ -512,11 +516,16 @@ def test_files_that_are_no_scenes_are_called_what_they_are(tmp_path, name, conte
 def test_folders_that_are_no_scenes(tmp_path):
     save(tmp_path / "mine" / "IMG_1.jpg", picture(0))
     (tmp_path / "mine" / "README.txt").write_text("my photos\n")
-    with pytest.raises(UserError, match=r"1 photos without poses: docs/start/own_photos.md"):
+    with pytest.raises(
+        UserError,
+        match=r"1 photo without poses: python -m roge_jax.pose \S+mine --out mine_scene finds them",
+    ):
         load_scene(tmp_path / "mine")
     (tmp_path / "films").mkdir()
     (tmp_path / "films" / "walk.mov").write_bytes(b"")
-    with pytest.raises(UserError, match=r"a video \(walk.mov\)"):
+    with pytest.raises(
+        UserError, match=r"a video: python -m roge_jax.pose \S+walk.mov --out walk_scene makes"
+    ):
         load_scene(tmp_path / "films")
     path = tmp_path / "p.json"
     path.write_text(json.dumps({"convention": "opencv", "frames": [{"pose": np.eye(4).tolist()}]}))

@@ -337,7 +337,9 @@ def test_damaged_files_are_named(tmp_path):
     images.write_bytes(images.read_bytes()[:90])
     with pytest.raises(UserError, match=r"images.bin: damaged or truncated"):
         load_scene(folder)
-    with pytest.raises(UserError, match="no known layout"):
+    with pytest.raises(
+        UserError, match=r"4 photos without poses, which lie beside this folder: give .*d"
+    ):
         load_scene(files.nerfstudio(tmp_path / "d", CAMERAS) / "images")
     with pytest.raises(UserError, match="no such scene folder"):
         load_scene(tmp_path / "nothing" / "here")

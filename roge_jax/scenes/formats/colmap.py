@@ -1,10 +1,12 @@
-"""COLMAP scenes: which of several models, and where its photos lie."""
+"""COLMAP scenes: which of several models, and where its photos and points lie."""
 
+import functools
 from pathlib import Path
 
 from roge_jax.scenes.colmap import find_models, holds_model, model_size, read_model
 from roge_jax.scenes.frames import Frame, Reading
 from roge_jax.scenes.pictures import PHOTO_FOLDERS, Finder, shrunk_folders
+from roge_jax.scenes.points import points_file, read_points3D
 
 ABOVE = 4  # folders between a model and the folder of its scene, at most
 
@@ -37,6 +39,8 @@ def read(folder: Path) -> Reading | None:
         reading.frames.append(Frame(picture, K, c2w, size, lens, name=name, cure=cure))
     reading.looked = f"'{reading.missing[0]}' in {pictures}" if reading.missing else ""
     reading.registered = "are registered, have a pose"
+    if points_file(model) is not None:
+        reading.points = functools.partial(read_points3D, model)
     others = [
         f"{m.relative_to(folder).as_posix()} ({n} photos)"
         for m, n in zip(models, sizes, strict=True)

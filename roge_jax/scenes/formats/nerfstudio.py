@@ -10,6 +10,7 @@ from roge_jax.scenes import entries
 from roge_jax.scenes.frames import Frame, Reading, in_axes
 from roge_jax.scenes.images import read_header
 from roge_jax.scenes.pictures import Finder, masks_beside
+from roge_jax.scenes.points import read_ply
 
 BLENDER = ("transforms_train.json", "transforms_val.json", "transforms_test.json")
 # Where ScanNet++ keeps its files, the undistorted ones first, and the folder that its names are relative to.
@@ -51,6 +52,7 @@ def read(files: list[Path], *, convention: str | None, photos: bool) -> Reading:
         whole.notes += part.notes
         whole.dropped += part.dropped
         whole.fps, whole.looked, whole.axes = part.fps, part.looked, part.axes
+        whole.points = whole.points or part.points
     return whole
 
 
@@ -97,6 +99,9 @@ def from_content(content: Any, file: Path, *, convention: str | None, photos: bo
             Frame(picture, K, in_axes(pose, axes), size, lens, name=_address(name))
         )
     reading.looked = f"'{reading.missing[0]}' in {file.parent}" if reading.missing else ""
+    cloud = content.get("ply_file_path") if isinstance(content, dict) else None
+    if isinstance(cloud, str) and is_file(file.parent / cloud):
+        reading.points = lambda _: read_ply(file.parent / cloud)
     if bad:
         reading.note(
             f"{bad} of {len(listed)} frames are marked 'is_bad' and left out",
