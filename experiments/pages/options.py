@@ -33,14 +33,16 @@ BLOCK = re.compile(r"(?:^    \S.*\n?)+", re.MULTILINE)
 
 
 def programs() -> Iterator[ModuleType]:
-    """Modules that can be run: those whose last lines say so."""
+    """Modules that people run: those whose last lines say so, and that take options."""
     for found in pkgutil.walk_packages(roge_jax.__path__, "roge_jax."):
         spec = importlib.util.find_spec(found.name)
         if spec is None or not (spec.origin or "").endswith(".py"):
             continue
         source = spec.loader.get_source(found.name)  # type: ignore[union-attr]
         if re.search(r'^if __name__ == "__main__":$', source, re.MULTILINE):
-            yield importlib.import_module(found.name)
+            module = importlib.import_module(found.name)
+            if hasattr(module, "parser") or hasattr(module, "execute"):
+                yield module
 
 
 def parser(module: ModuleType) -> argparse.ArgumentParser:

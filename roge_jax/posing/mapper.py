@@ -112,7 +112,9 @@ class Work:
                 done += len(batch)
                 say("features", done, len(job.copies))
         with self._open() as database:
-            numbers = {image.name: image.image_id for image in database.read_all_images()}
+            numbers: dict[Any, Any] = {
+                image.name: image.image_id for image in database.read_all_images()
+            }
             self.ids = [numbers[job.copy(i)] for i in range(len(job.copies))]
             return [database.num_keypoints_for_image(i) for i in self.ids]
 
@@ -236,7 +238,7 @@ def solve(work: Work) -> tuple[Any, dict[str, Any]]:
             best, how = better, name
         say("poses", 0 if best is None else best.num_reg_images(), len(work.ids))
     held = _drifted(work, best)
-    if held:
+    if held and best is not None:
         found = [
             models.hanging_together(m, work.ids, geometries)
             for m in work.incremental(hold_focal=True)

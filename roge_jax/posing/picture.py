@@ -99,4 +99,4 @@ def _frustum(cameras: Cameras, i: int, length: float) -> np.ndarray:
 def _ramp(count: int) -> list[tuple[int, int, int]]:
     t = np.linspace(0, 1, max(count, 2))[:count, None]
     mix = (1 - t) * np.array(FIRST) + t * np.array(LAST)
-    return [tuple(int(v) for v in row) for row in mix]
+    return [(int(r), int(g), int(b)) for r, g, b in mix]

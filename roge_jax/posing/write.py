@@ -76,7 +76,7 @@ def write_photo(place: Path, shot: Shot, camera: dict[str, Any]) -> None:
     size = tuple(camera["new_size"])
     K, new_K = np.array(camera["K"]), np.array(camera["new_K"])
     photo = Photo(shot.file, size, lens=lens, K=K, new_K=new_K, straight=size)
-    more = {} if place.suffix == ".png" else {"quality": QUALITY, "subsampling": 0}
+    more: dict[str, Any] = {} if place.suffix == ".png" else {"quality": QUALITY, "subsampling": 0}
     Image.fromarray(to_uint8(photo.read())).save(place, **more)
 
 

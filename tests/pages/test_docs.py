@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from experiments.pages import options as made_options
-from roge_jax import check, convert, evaluate, export, pose, sample, train, view
+from roge_jax import check, convert, evaluate, export, pose, sample, train
 from roge_jax.files import entry
 from roge_jax.procedural import __main__ as procedural_program
 from roge_jax.procedural import scenes as procedural
