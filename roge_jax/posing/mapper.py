@@ -112,9 +112,7 @@ class Work:
                 done += len(batch)
                 say("features", done, len(job.copies))
         with self._open() as database:
-            numbers: dict[Any, Any] = {
-                image.name: image.image_id for image in database.read_all_images()
-            }
+            known = {image.name: image.image_id for image in database.read_all_images()}
             self.ids = [numbers[job.copy(i)] for i in range(len(job.copies))]
             return [database.num_keypoints_for_image(i) for i in self.ids]
 
