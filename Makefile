@@ -24,7 +24,9 @@ GENERATED := experiments.pages.options experiments.pages.messages experiments.pa
 	experiments.pages.diagrams experiments.pages.evaluations
 HERO := experiments.pages.hero
 FIRST := experiments.quality.optimise_schedules
-FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED) $(HERO),$(EXPERIMENTS)))
+# Of scenes that nobody has unless he says where.
+GIVEN := experiments.quality.pose
+FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED) $(HERO) $(GIVEN),$(EXPERIMENTS)))
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
 
 .DEFAULT_GOAL := help

@@ -113,7 +113,7 @@ class Work:
                 say("features", done, len(job.copies))
         with self._open() as database:
             known = {image.name: image.image_id for image in database.read_all_images()}
-            self.ids = [numbers[job.copy(i)] for i in range(len(job.copies))]
+            self.ids = [known[job.copy(i)] for i in range(len(job.copies))]
             return [database.num_keypoints_for_image(i) for i in self.ids]
 
     def _camera(self, group: Sequence[int]) -> Any:
