@@ -1,4 +1,4 @@
-"""The tables of docs/results/model_card.md, from what `roge_jax.evaluate` wrote into experiments/results.
+"""The tables of docs/results/model_card.md and of the README, from what `roge_jax.evaluate` wrote into experiments/results.
 
         python -m experiments.pages.evaluations
 
@@ -42,7 +42,12 @@ TABLES = {
     "wide": ("mini_wide.json", False),
     "apart": ("mini_real.json", True),
     "close": ("mini_close.json", True),
+    "apart large": ("mini_real_192x336.json", True),
+    "close large": ("mini_close_192x336.json", True),
 }
+README = harness.ROOT / "README.md"
+FEW = ("generated", "rgb_head", "plane_sweep", "plane", "nearest")  # what the README compares
+TWO = ("mini_close_192x336.json", "mini_real_192x336.json")  # there, side by side
 
 
 def means(record: dict[str, Any]) -> list[str]:
@@ -70,14 +75,28 @@ def means(record: dict[str, Any]) -> list[str]:
     return harness.table(["", *(METRICS[name][0] for name in metrics)], rows)
 
 
+def shown_by_scene(record: dict[str, Any]) -> list[str]:
+    """The metrics of `by_scene`."""
+    learned = [
+        name for name in ("ssim", "lpips_alex") if "lpips_alex" in record["means"]["nearest"]
+    ]
+    return ["psnr", *learned]
+
+
 def by_scene(record: dict[str, Any]) -> list[str]:
-    """PSNR of every scene, and the mean; the best is bold."""
+    """PSNR of every scene, with SSIM and LPIPS where that was measured, and the mean; the best by the last is bold."""
     methods = [method for method in METHODS if method in record["means"]]
-    rows = []
+    metrics = shown_by_scene(record)
+    if len(metrics) > 1:
+        methods = [method for method in methods if method in FEW]
+    judge, rows = METRICS[metrics[-1]][2], []
     for entry in [*record["scenes"], {"scene": "mean", **record["means"]}]:
-        values = {m: entry[m]["psnr"] for m in methods if m not in CEILINGS}
-        best = max(values, key=values.__getitem__)
-        cells = [f"{entry[m]['psnr']:.2f}" for m in methods]
+        values = {m: entry[m][metrics[-1]] for m in methods if m not in CEILINGS}
+        best = judge(values, key=values.__getitem__)
+        cells = [
+            " / ".join(f"{entry[m][k]:.{METRICS[k][1]}f}".removeprefix("0") for k in metrics)
+            for m in methods
+        ]
         rows.append(
             [
                 entry["scene"],
@@ -103,6 +122,23 @@ def paired(record: dict[str, Any]) -> list[str]:
     return harness.table(["paired by scene", "PSNR", "sharpness", "ahead in PSNR"], rows)
 
 
+def side_by_side() -> list[str]:
+    """The table of the README: `FEW` methods, photos close together and far apart; the best of a column is bold."""
+    metrics = ("psnr", "ssim", "lpips_alex")
+    columns = [(harness.read(file)["means"], metric) for file in TWO for metric in metrics]
+    rows = []
+    for method in FEW:
+        cells = []
+        for found, metric in columns:
+            _, digits, better = METRICS[metric]
+            text = f"{found[method][metric]:.{digits}f}".removeprefix("0")
+            best = better(found[name][metric] for name in FEW)
+            cells.append(f"**{text}**" if found[method][metric] == best else text)
+        rows.append([METHODS[method], *cells[:3], "", *cells[3:]])
+    titles = [METRICS[metric][0] for metric in metrics]
+    return harness.table(["", *titles, "", *titles], rows)
+
+
 def described(record: dict[str, Any]) -> str:
     """What was measured, in a line."""
     settings = record["settings"]
@@ -123,7 +159,9 @@ def tables() -> dict[str, str]:
     for mark, (file, scene_by_scene) in TABLES.items():
         record = harness.read(file)
         lines = [described(record), "", *means(record), "", *paired(record)]
-        lines += ["", "PSNR by scene:", "", *by_scene(record)] if scene_by_scene else []
+        if scene_by_scene:
+            names = " / ".join(METRICS[name][0] for name in shown_by_scene(record))
+            lines += ["", f"{names} by scene:", "", *by_scene(record)]
         found[mark] = "\n".join(lines)
     return found
 
@@ -131,4 +169,5 @@ def tables() -> dict[str, str]:
 if __name__ == "__main__":
     for mark, text in tables().items():
         harness.put(PAGE, mark, text)
+    harness.put(README, "scores", "\n".join(side_by_side()))
     print(PAGE.relative_to(harness.ROOT), *TABLES)

@@ -33,6 +33,11 @@ def test_tables_are_those_of_the_stored_evaluations(mark):
     assert text in evaluations.PAGE.read_text(), "run python -m experiments.pages.evaluations"
 
 
+def test_the_table_of_the_readme_is_that_of_the_stored_evaluations():
+    text = f"{WRITTEN.format('scores')}\n\n" + "\n".join(evaluations.side_by_side()) + "\n"
+    assert text in evaluations.README.read_text(), "run python -m experiments.pages.evaluations"
+
+
 def test_no_other_drawings_lie_there():
     assert {file.stem for file in diagrams.MEDIA.glob("*.svg")} == set(diagrams.DRAWINGS)
 
