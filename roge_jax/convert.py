@@ -259,10 +259,11 @@ def choose_config(
         chosen = _fitted(chosen, wan, parts)
     else:
         chosen = alone(recon) if parts == "reconstruction" else _found(wan, recon, parts)
-    files = {"dit": wan, "encoder": recon, "dino": recon, "renderer": recon}
+    fits = chosen.encoder.dino_depth > 0  # or `fill_recon` says that it does not
+    files = {"dit": wan} | dict.fromkeys(("encoder", "dino", "renderer"), recon if fits else None)
     known = {network: file for network, file in files.items() if file is not None}
     if recon is not None and published.family(recon)[0] == "vggt":
-        del known["renderer"]
+        known.pop("renderer", None)
     settled = heads.settle(chosen, known, given or {}, asked=name is not None)
     if settled != chosen and name is None and parts != "reconstruction":
         settled = dataclasses.replace(settled, name="custom")

@@ -140,7 +140,7 @@ def main(args: argparse.Namespace) -> None:
 
         return print(describe())
     if args.preview_only:
-        check_options(args, "--preview-only runs none: leave one of the two away")
+        check_options(args, "--preview-only runs none")
     settings = sampling.Settings(
         steps=args.steps or 0,
         solver=args.solver or "",
@@ -221,7 +221,7 @@ def main(args: argparse.Namespace) -> None:
 def previews(args: argparse.Namespace, config) -> bool:
     """Whether nothing is generated: that was asked for, or there is nothing to generate with."""
     if config.parts == "reconstruction":
-        check_options(args, f"{args.checkpoint} is a reconstruction alone: leave it away")
+        check_options(args, f"{args.checkpoint} is a reconstruction alone")
     return args.preview_only or config.parts == "reconstruction"
 
 
@@ -244,7 +244,7 @@ def check_options(args: argparse.Namespace, why: str) -> None:
         value = getattr(args, name)
         if value != unused.get_default(name):
             option = f"--{name.replace('_', '-')}" + (f" {value}" if value is not True else "")
-            raise UserError(f"{option} is for the generator, and {why}.")
+            raise UserError(f"{option} is for the generator, and {why}: leave that option away.")
 
 
 def dry_run(args: argparse.Namespace, settings) -> str:

@@ -30,9 +30,11 @@ class Published(NamedTuple):
 
     @property
     def command(self) -> str:
-        """Downloads what is read into a folder of that name."""
-        patterns = " ".join(f"'{p}'" if "*" in p else p for p in self.files)
-        return f"hf download {self.repository} --include {patterns} --local-dir {self.name}"
+        """Downloads what is read into a folder of that name; `--include` takes one pattern each time."""
+        patterns = " ".join(
+            f"--include '{p}'" if "*" in p else f"--include {p}" for p in self.files
+        )
+        return f"hf download {self.repository} {patterns} --local-dir {self.name}"
 
 
 class Trained(NamedTuple):
@@ -46,7 +48,7 @@ _WAN, _FAIR = "Apache-2.0", "FAIR Noncommercial Research License"
 _TEXT, _VAE = "models_t5_umt5-xxl-enc-bf16.pth", "Wan2.1_VAE.pth"
 _ONE = ("config.json", "diffusion_pytorch_model.safetensors", _VAE, _TEXT)
 _SHARDS = ("config.json", "diffusion_pytorch_model*", _VAE, _TEXT)
-_DIFFUSERS = ("transformer/*", "vae/*", "text_encoder/*")
+_DIFFUSERS = ("transformer/*", "vae/*.safetensors", "text_encoder/model*")
 
 # In the order of docs/start/published_weights.md.
 PUBLISHED = (
@@ -54,10 +56,10 @@ PUBLISHED = (
     Published("facebook/lagernvs_dl3dv_2-6_v_256", ("model.pt",), 4.41, _FAIR, gated=True),
     Published("facebook/lagernvs_re10k_2v_256", ("model.pt",), 3.99, _FAIR, gated=True),
     Published("facebook/VGGT-1B", ("model.safetensors",), 5.03, "VGGT License"),
-    Published("Wan-AI/Wan2.1-T2V-1.3B", _ONE, 17.55, _WAN),
+    Published("Wan-AI/Wan2.1-T2V-1.3B", _ONE, 17.545, _WAN),
     Published("Wan-AI/Wan2.1-T2V-14B", _SHARDS, 69.02, _WAN),
-    Published("Wan-AI/Wan2.1-I2V-14B-480P", _SHARDS, 77.45, _WAN),
-    Published("Wan-AI/Wan2.1-I2V-14B-720P", _SHARDS, 77.45, _WAN),
+    Published("Wan-AI/Wan2.1-I2V-14B-480P", _SHARDS, 77.449, _WAN),
+    Published("Wan-AI/Wan2.1-I2V-14B-720P", _SHARDS, 77.449, _WAN),
     Published("Wan-AI/Wan2.1-I2V-14B-480P-Diffusers", _DIFFUSERS, 88.81, _WAN),
 )
 BY_NAME = {one.name: one for one in PUBLISHED}

@@ -161,24 +161,25 @@ def _folder(folder: Path) -> dict[str, Stored]:
     if len(torch) == 1:
         return read_torch_header(torch[0])
     if not torch:
-        raise UserError(f"{folder} holds no weights{_instead(folder)}")
+        what, cure = _instead(folder)
+        raise UserError(f"{folder} holds no weights ({what}): {cure}.")
     found = ", ".join(f.name for f in torch)
     raise UserError(
         f"{folder} holds no safetensors (PyTorch files there: {found}): give the weight file itself."
     )
 
 
-def _instead(folder: Path) -> str:
+def _instead(folder: Path) -> tuple[str, str]:
     """What a folder has in place of weights, and what to do."""
     known = BY_NAME.get(name_of(folder) or "")
-    cure = how_to_get(known) if known else "give the folder that the weights were downloaded to"
     unfinished = (".cache/huggingface/download", "../../blobs")
     if any(any((folder / place).glob("**/*.incomplete")) for place in unfinished):
         again = f"`{known.command}`" if known else "the same `hf download` command"
-        return f", because their download was not finished: {again} goes on with it."
+        return "their download was not finished", f"go on with it by {again}"
+    cure = how_to_get(known) if known else "give the folder that the weights were downloaded to"
     names = sorted(f.name for f in folder.iterdir() if not f.name.startswith("."))
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return f" ({f'only {shown}' if names else 'it is empty'}): {cure}."
+    return f"only {shown}" if names else "it is empty", cure
 
 
 def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:

@@ -71,6 +71,6 @@ def check_content(file: Path) -> None:
         )
     if start.lstrip()[:9].lower().startswith((b"<!doctype", b"<html")):
         raise UserError(
-            f"{file} is a web page and no weights, as comes where access was not granted: ask for it on the model's page, "
-            "log in with `hf auth login` and download the file again."
+            f"{file} is a web page and no weights, as comes where access was not granted: ask for it on the page of the "
+            "model, log in with `hf auth login` and download the file again."
         )

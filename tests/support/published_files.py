@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import zipfile
+import zlib
 from pathlib import Path
 
 import ml_dtypes
@@ -166,4 +167,46 @@ def save_torch(file: Path, shapes, value, wrapper: str | None = None, dtypes=Non
                 f"archive/data/{i}", np.ascontiguousarray(value(key, shape), dtype).tobytes()
             )
         archive.writestr("archive/version", "3\n")
+    return file
+
+
+def save_torch_headers(file: Path, shapes, wrapper: str | None = None, dtypes=None) -> Path:
+    """A PyTorch file of full size that takes no disk: all but the zeros of its tensors is written (a sparse file).
+
+    The zip file is put together by hand, in its form for more than 4 GB: `zipfile` would write the zeros.
+    """
+    small = file.with_suffix(".pickle")
+    save_torch(small, shapes, lambda key, shape: np.zeros(0, np.float32), wrapper, dtypes)
+    with zipfile.ZipFile(small) as archive:
+        content = archive.read("archive/data.pkl")
+    small.unlink()
+    width = {"F32": 4, "BF16": 2}
+    sizes = [int(np.prod(s)) * width[(dtypes or {}).get(k, "F32")] for k, s in shapes.items()]
+    members = [("archive/data.pkl", content, len(content)), ("archive/byteorder", b"little", 6)]
+    members += [(f"archive/data/{i}", b"", size) for i, size in enumerate(sizes)]
+    central, offset = b"", 0
+    with file.open("wb") as f:
+        for name, head, size in members:
+            f.seek(offset)
+            crc = (zlib.crc32(head) if head else 0).to_bytes(4, "little")
+            fixed = b"\0\0" * 2 + b"\0" * 4 + crc + b"\xff" * 8  # stored; sizes are in the extra
+            lengths = len(name).to_bytes(2, "little")
+            wide = size.to_bytes(8, "little") * 2
+            extra = b"\1\0" + len(wide).to_bytes(2, "little") + wide
+            f.write(b"PK\3\4" + b"\x2d\0" + fixed + lengths + len(extra).to_bytes(2, "little"))
+            f.write(name.encode() + extra + head)
+            start, offset = offset, f.tell() - len(head) + size
+            wide += start.to_bytes(8, "little")
+            extra = b"\1\0" + len(wide).to_bytes(2, "little") + wide
+            central += b"PK\1\2" + b"\x2d\0" * 2 + fixed + lengths
+            central += len(extra).to_bytes(2, "little") + b"\0" * 10 + b"\xff" * 4
+            central += name.encode() + extra
+        count = len(members).to_bytes(8, "little")
+        end = b"PK\6\6" + (44).to_bytes(8, "little") + b"\x2d\0" * 2 + b"\0" * 8 + count * 2
+        end += len(central).to_bytes(8, "little") + offset.to_bytes(8, "little")
+        place = (offset + len(central)).to_bytes(8, "little")
+        f.seek(offset)
+        f.write(central + end)
+        f.write(b"PK\6\7" + b"\0" * 4 + place + b"\1\0\0\0")
+        f.write(b"PK\5\6" + b"\0" * 4 + b"\xff" * 12 + b"\0\0")
     return file
