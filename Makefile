@@ -14,7 +14,7 @@ AOT_VENV := .venv-aot
 AOT := $(AOT_VENV)/.aot
 CODE := roge_jax tests experiments
 # Programs of the experiments; stored sampling grids come first, because the charts use them. Left out: what `figures`
-# only draws, comparisons with PyTorch (`make compare`), and what needs the compiler of GPUs.
+# only draws, comparisons with PyTorch (`make compare`), what needs the compiler of GPUs, and what needs scenes of your own.
 EXPERIMENTS := $(subst /,.,$(basename $(shell grep -l '^if __name__' experiments/*/*.py)))
 DRAWN := experiments.quality.training_curves
 COMPARISONS := experiments.speed.dit experiments.speed.vae experiments.speed.real_size

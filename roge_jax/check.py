@@ -140,6 +140,7 @@ def _numbers(scene: Scene, cameras: Cameras, config: Config) -> dict[str, Any]:
         "baseline_max": info.context_reach,
         "baseline_neighbours": float(np.median(steps)) if len(steps) else 0.0,
         "focus_distance": focus_distance(cameras),
+        **_about_points(scene),
         "status": info.status,
         "divisor": info.divisor,
         "straightness": straightness(cameras.centres),
@@ -148,6 +149,14 @@ def _numbers(scene: Scene, cameras: Cameras, config: Config) -> dict[str, Any]:
         "offset": float(np.abs(cameras.centres).max()),
         "crop_keeps": float(min(kept)),
     }
+
+
+def _about_points(scene: Scene) -> dict[str, Any]:
+    """How many sparse points lie beside the poses, and how far away the photos see them (median)."""
+    if not scene.points:
+        return {}
+    depths = [d for view in range(len(scene)) if (d := scene.depth(view)) is not None]
+    return {"points": len(scene.points), "points_distance": float(np.median(depths or [np.nan]))}
 
 
 def _about_poses(scene: Scene, cameras: Cameras) -> list[Finding]:
@@ -272,6 +281,10 @@ def render(report: Report) -> str:
             f"axes      meet in front of the cameras in {n['axes_meet_in_front']} pairs, behind in "
             f"{n['axes_meet_behind']}",
         ]
+    if "points" in n:
+        lines.append(
+            f"points    {n['points']} sparse ones, {n['points_distance']:.4g} away (median)"
+        )
     if "epipolar_pixels" in n:
         lines.append(
             f"poses     matched features fit them to {n['epipolar_pixels']:.2f} pixels "

@@ -1,5 +1,7 @@
 """Which frames of a video become photos."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -71,6 +73,19 @@ def test_a_video_is_measured_and_its_frames_are_written(tmp_path):
     assert [int(file.stem) for file in files] == chosen
     pixels = 255.0 * read_image(files[3])
     assert np.abs(pixels - film()).mean((1, 2, 3)).argmin() == chosen[3]
+
+
+def test_a_phone_held_upright_gives_upright_photos(tmp_path):
+    """Phones store upright videos lying down, with a matrix in the track's header that turns them clockwise."""
+    video = write_video(tmp_path / "walk.mp4", film()[:3], fps=10)
+    data = bytearray(video.read_bytes())
+    matrix = data.index(b"tkhd") + 44
+    assert struct.unpack_from(">9i", data, matrix) == (1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
+    struct.pack_into(">9i", data, matrix, 0, 1 << 16, 0, -(1 << 16), 0, 0, 0, 0, 1 << 30)
+    (file := tmp_path / "turned.mp4").write_bytes(data)
+    (tmp_path / "out").mkdir()
+    turned, lying = (read_image(extract(v, [1], tmp_path / "out")[0]) for v in (file, video))
+    np.testing.assert_allclose(turned, np.rot90(lying, -1), atol=0.1)
 
 
 def test_files_that_are_no_videos_are_named(tmp_path):
