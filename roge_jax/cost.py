@@ -86,7 +86,7 @@ def renderer(
 
 
 def lookup(cfg: RendererConfig, height: int, width: int, m: int, views: int) -> float:
-    """Matrix products and convolutions of `recon.lookup`; fetching from the photos is not counted."""
+    """Matrix products and convolutions of `recon.lookup` at the model's size; fetching from the photos is not counted."""
     if not cfg.lookup:
         return 0.0
     pixels, c, fine = height * width, WIDTH, FINE

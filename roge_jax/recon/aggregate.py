@@ -14,10 +14,7 @@ BELIEF = 1.0  # weight of the network's logarithmic probability beside the evide
 LEAST = -12.0  # it is not taken for less
 HIDDEN = 20.0  # further cost of cuts that no photo sees
 STEP, JUMP = 1.2, 10.0  # cost of a neighbour one cut, and more than one cut, away
-AROUND, BEYOND = (
-    2,
-    1.5,
-)  # the range of a finer level: coarse answers so many pixels around, and steps more
+AROUND = 2  # pixels: a finer level looks between the coarse answers of these
 TAIL, MARGIN = 0.02, 1.2  # of inverse depths: left out at either end, and added again
 TOGETHER = 1.5  # cuts by which neighbours on one surface differ at most
 
@@ -95,10 +92,8 @@ def envelope(
     window, ones = (side, side), (1, 1)
     low = jax.lax.reduce_window(low, jnp.inf, jax.lax.min, window, ones, "SAME")
     high = jax.lax.reduce_window(high, -jnp.inf, jax.lax.max, window, ones, "SAME")
-    size = (height, width)
-    return jax.image.resize(box(low, 1), size, "linear"), jax.image.resize(
-        box(high, 1), size, "linear"
-    )
+    low, high = jax.image.resize(box(jnp.stack([low, high]), 1), (2, height, width), "linear")
+    return low, high
 
 
 def occupied(inverse: jax.Array, count: int) -> jax.Array:

@@ -2,8 +2,9 @@
 
 Not in the paper (`RendererConfig.lookup`, on in `mini`): a renderer trained for hours instead of weeks puts things where
 they belong but blurs them, and what it lost is in the photos. As in plane sweeping (Collins 1996; Yao et al. 2018,
-"MVSNet") a ray is cut at many inverse depths, but nothing is told what depth is right: the distribution over the cuts is
-an attention, learned from the photometric term alone, and no depth map, point or other 3D thing leaves this module.
+"MVSNet") a ray is cut at many inverse depths, but nothing here is told what depth is right: the distribution over the cuts
+is an attention, learned from the photometric term alone. A picture larger than the model (`full`) asks all rays of a view
+together (`recon.depth`), with features that did learn from depth.
 
 1. Coarse, per cell of 4 x 4 pixels: at each of `RendererConfig.lookup` cuts, how well do features of the photos agree
    where the cut projects to, and how well do their colours agree there, in the region and in the whole view? Together

@@ -1,7 +1,7 @@
 """Image-based rendering at any size: the photos' own pixels at the cut that a view's rays agree on.
 
-Cut, blending weights and trust are found at the model's size (`recon.lookup`); colours are read here, from photos as fine
-as they are given, so a picture is as sharp as they are. Where photos are finer than the picture they are read from a
+Blending weights and trust are found at the model's size (`recon.lookup`), depths at that and at twice of it
+(`recon.depth`); colours are read here, from photos as fine as they are given, so a picture is as sharp as they are. Where photos are finer than the picture they are read from a
 level of a pyramid that is not (Williams 1983).
 """
 
@@ -66,7 +66,7 @@ class Photos(NamedTuple):
 
 
 class Blend(NamedTuple):
-    """What a view takes from the photos, at the model's size."""
+    """What a view takes from the photos; at the model's size, apart from the depths."""
 
     inverse: jax.Array  # [v, ., .] inverse depth, at the model's size or larger
     step: jax.Array  # [v] between the inverse depths that were compared
