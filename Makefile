@@ -27,7 +27,8 @@ FIRST := experiments.quality.optimise_schedules
 # Of scenes that nobody has unless he says where.
 GIVEN := experiments.quality.pose
 FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COMPARISONS) $(COMPILED) $(GENERATED) $(HERO) $(GIVEN),$(EXPERIMENTS)))
-PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist loadfile --no-loadscope-reorder -q
+# Workers take over each other's tests at the end, so that none waits for one long file. Lines end in tests done of all.
+PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal -o console_output_style=count --durations 8
 
 .DEFAULT_GOAL := help
 .PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators check lint format figures compare notebook docs clean
@@ -51,8 +52,8 @@ smoke: $(BASE)  ## both programs on tiny sizes and random weights
 test: $(DEV)  ## the fast tests
 	$(PYTEST) $(ARGS)
 
-test-slow: $(DEV)  ## tests that take minutes or gigabytes
-	$(RUN) -m pytest -q -m slow $(ARGS)
+test-slow: $(DEV)  ## tests that take minutes or gigabytes, one after another; says how long each took
+	$(RUN) -m pytest -m slow -o console_output_style=count --durations 20 $(ARGS)
 
 test-parity: $(PARITY)  ## tests against PyTorch implementations (installs torch and diffusers)
 	$(RUN) -m pytest -q -m parity $(ARGS)

@@ -43,32 +43,8 @@ def pytest_configure(config):
     settings.load_profile("roge")
 
 
-# Files by the time they take, longest first: `make test` deals out whole files, so that nothing is compiled twice.
-LONGEST = (
-    "train_recipe",
-    "train_program",
-    "notebooks",
-    "procedural",
-    "sample",
-    "model",
-    "lookup",
-    "estimate",
-    "preview",
-    "evaluate",
-    "train_stress",
-    "readme",
-    "vae",
-    "dit",
-    "solvers",
-    "long",
-    "sharding",
-)
-
-
 def pytest_collection_modifyitems(config, items):
-    """Longest files first. Leave out `slow` and `parity` tests unless a mark expression or a node id asks for them."""
-    rank = {f"test_{name}": i for i, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+    """Leave out `slow` and `parity` tests unless a mark expression or a node id asks for them."""
     if config.option.markexpr or any("::" in str(arg) for arg in config.invocation_params.args):
         return
     chosen, left = [], []

@@ -4,15 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 
 from roge_jax.core.params import init
 from roge_jax.recon import lookup, sweep
 
+lookup, sweep = compiled(lookup), compiled(sweep)
 H, W, CUTS, D = 16, 24, 12, 8
 RNG = np.random.default_rng(0)
 # All leaves at zero: every network returns its bias, which is zero too.
-SILENT = jax.tree.map(jnp.zeros_like, init(jax.random.key(0), lookup.lookup_specs(D, 8, CUTS)))
-ALONE = jnp.eye(3)  # photos from places far apart
+SILENT = jax.tree.map(np.zeros_like, init(jax.random.key(0), lookup.lookup_specs(D, 8, CUTS)))
+ALONE = np.eye(3, dtype=np.float32)  # photos from places far apart
 
 
 def softmax(x, axis):
@@ -22,8 +24,8 @@ def softmax(x, axis):
 
 def own_camera() -> sweep.Motion:
     """From a view to one photo from the same camera: every cut of a ray is seen in the ray's own pixel."""
-    K = jnp.asarray([[[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]])
-    way = sweep.motion(K, jnp.eye(4)[None], K, jnp.eye(4)[None])
+    K = np.asarray([[[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]])
+    way = sweep.motion(K, np.eye(4)[None], K, np.eye(4)[None])
     return sweep.Motion(way.turn[0], way.shift[0])
 
 
@@ -48,7 +50,7 @@ def test_the_choice_of_a_photo_starts_from_one_over_its_distance_squared():
     seen = np.ones((3, H, W, 1))
     seen[0, :4] = 0.0  # the first photo does not see the upper rows
     looked, some, about, weights = lookup._chosen(
-        SILENT["choose"], *map(jnp.asarray, (found, seen)), ALONE, far, jnp.full((H, W, 3), 0.5)
+        SILENT["choose"], *map(jnp.asarray, (found, seen)), ALONE, far, np.full((H, W, 3), 0.5)
     )
     share = seen / far**2 / (seen / far**2).sum(0)
     np.testing.assert_allclose(weights, share, atol=0.02)
@@ -75,9 +77,9 @@ def test_upsampled_cells_are_means_of_their_neighbours():
     """A flat map stays flat to its borders, whatever the weights; equal weights are a mean over nine cells."""
     ch, cw = 4, 6
     weights = jnp.asarray(RNG.standard_normal((ch, cw, 9 * lookup.CELL**2)))
-    np.testing.assert_allclose(lookup._upsampled(weights, jnp.full((ch, cw), 7.0)), 7.0, rtol=1e-6)
+    np.testing.assert_allclose(lookup._upsampled(weights, np.full((ch, cw), 7.0)), 7.0, rtol=1e-6)
     x = RNG.random((ch, cw))
-    big = lookup._upsampled(jnp.zeros_like(weights), jnp.asarray(x))
+    big = lookup._upsampled(np.zeros_like(weights), jnp.asarray(x))
     assert big.shape == (ch * lookup.CELL, cw * lookup.CELL)
     for row, column in ((1, 1), (2, 4)):
         nine = x[row - 1 : row + 2, column - 1 : column + 2].mean()
@@ -101,13 +103,13 @@ def test_the_coarse_answer_is_the_peak_and_its_neighbours():
     logits, colours, cut, mass, _ = lookup._coarse(
         SILENT,
         jnp.asarray(maps),
-        jnp.eye(1),
+        np.eye(1),
         own_camera(),
         1.0,
         jnp.asarray(prior),
-        jnp.zeros((ch, cw, lookup.WIDTH)),
-        jnp.zeros((ch, cw, 3)),
-        jnp.zeros((CUTS, ch, cw, lookup.AGREED)),
+        np.zeros((ch, cw, lookup.WIDTH)),
+        np.zeros((ch, cw, 3)),
+        np.zeros((CUTS, ch, cw, lookup.AGREED)),
     )
     share, numbers = softmax(prior.astype(np.float64), -1), np.arange(CUTS)
     about = share * (np.abs(numbers - prior.argmax(-1)[..., None]) <= 2)
@@ -121,23 +123,26 @@ def test_the_coarse_answer_is_the_peak_and_its_neighbours():
 def test_fine_cuts_stand_a_quarter_apart_about_the_coarse_one(reach):
     """What the fine network favours moves the cut by its offset, and the colours are those found at its depth."""
     apart, focal = 0.1, 20.0
-    K = jnp.asarray([[[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]]])
-    way = sweep.motion(K, jnp.eye(4)[None], K, jnp.eye(4)[None].at[:, 0, 3].set(apart))
+    K = np.asarray([[[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]]])
+    beside = np.eye(4)[None]
+    beside[:, 0, 3] = apart
+    way = sweep.motion(K, np.eye(4)[None], K, beside)
     ramp = np.broadcast_to((np.arange(W) + 0.5)[None, None, :, None], (1, H, W, 3))
     cut = jnp.asarray(RNG.uniform(2.0, 9.0, (H, W)), jnp.float32)
     for place, moves in ((0, -0.875), (5, 0.375)):
-        bias = jnp.zeros(lookup.FINE).at[place].set(50.0)
+        bias = np.zeros(lookup.FINE, np.float32)
+        bias[place] = 50.0
         p = SILENT["fine"] | {"conv3": SILENT["fine"]["conv3"] | {"bias": bias}}
         way_of_one = sweep.Motion(way.turn[0], way.shift[0])
         found, seen, refined = lookup._fine(
             p,
             jnp.asarray(ramp, jnp.float32),
-            jnp.eye(1),
+            np.eye(1),
             CUTS,
             way_of_one,
             reach,
             cut,
-            jnp.zeros((H, W, 3)),
+            np.zeros((H, W, 3)),
         )
         np.testing.assert_allclose(refined, cut + moves, rtol=1e-5)
         inverse = (reach * np.asarray(cut + moves) / (CUTS - 1)) ** sweep.SPACING / sweep.NEAREST
@@ -151,16 +156,18 @@ def test_fine_cuts_stand_a_quarter_apart_about_the_coarse_one(reach):
 def test_a_photo_from_aside_is_far_from_near_things_and_close_to_distant_ones(favoured, near):
     """Of a photo from the view's own place, turned a little, and one from beside it: parallax is distance over depth."""
     p = init(jax.random.key(0), lookup.lookup_specs(D, 8, CUTS))
-    p = jax.tree.map(jnp.zeros_like, p)
-    likely = jnp.concatenate([30.0 * jax.nn.one_hot(favoured, CUTS), jnp.zeros(lookup.WIDTH)])
-    p["prior"]["bias"] = jnp.tile(likely, 4)
-    K = jnp.tile(jnp.asarray([[[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]]), (2, 1, 1))
+    p = jax.tree.map(np.zeros_like, p)
+    likely = np.zeros(CUTS + lookup.WIDTH, np.float32)
+    likely[favoured] = 30.0
+    p["prior"]["bias"] = np.tile(likely, 4)
+    K = np.tile(np.asarray([[[20.0, 0, W / 2], [0, 20.0, H / 2], [0, 0, 1]]]), (2, 1, 1))
     s, c = np.sin(0.2), np.cos(0.2)
-    turned = jnp.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    seen_by = jnp.tile(jnp.eye(4), (2, 1, 1)).at[0, :3, :3].set(turned).at[1, 0, 3].set(0.2)
-    photos = jnp.broadcast_to(jnp.asarray([0.2, 0.8])[:, None, None, None], (2, H, W, 3))
-    features, head = jnp.zeros((1, H // 8, W // 8, D)), jnp.full((1, H, W, 3), 0.5)
-    of = K[:1], jnp.eye(4)[None]
+    turned = np.asarray([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    seen_by = np.tile(np.eye(4), (2, 1, 1))
+    seen_by[0, :3, :3], seen_by[1, 0, 3] = turned, 0.2
+    photos = np.broadcast_to(np.asarray([0.2, 0.8])[:, None, None, None], (2, H, W, 3))
+    features, head = np.zeros((1, H // 8, W // 8, D)), np.full((1, H, W, 3), 0.5)
+    of = K[:1], np.eye(4)[None]
     found = lookup.look_up(p, features, head, photos, of, (K, seen_by), cuts=CUTS)
     distances = np.array([2 * np.sin(0.1), 0.2 * sweep.inverse_depth(jnp.float32(favoured), CUTS)])
     share = distances**-2.0 / (distances**-2.0).sum()

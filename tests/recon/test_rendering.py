@@ -3,14 +3,14 @@
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from test_lookup import CUTS, RNG, D, H, W, init, side_by_side, textured_plane
 
 from roge_jax.recon import aggregate, lookup, rendering, sweep
 
-ALONE = jnp.eye(2)
+aggregate, lookup, rendering, sweep = map(compiled, (aggregate, lookup, rendering, sweep))
 
 
 def dynamic_programming(cost: np.ndarray) -> float:
@@ -28,7 +28,7 @@ def test_semi_global_costs_are_those_of_the_best_path():
     """Along a single row both ways meet: at every pixel the two sums less its own cost are the best path through it."""
     cost = RNG.random((6, 1, 9))
     both = 4.0 * np.asarray(
-        aggregate.semi_global(jnp.asarray(cost))
+        aggregate.semi_global(np.asarray(cost))
     )  # up and down see themselves alone
     along = both[:, 0] - 2.0 * cost[:, 0]
     through = along - cost[:, 0]  # each way subtracts the least cost before it
@@ -51,28 +51,28 @@ def test_a_lone_outlier_follows_its_neighbours_and_an_edge_stays():
     np.put_along_axis(cost, truth[None], 0.0, 0)
     cost[:, 5, 3] = 0.2
     cost[7, 5, 3] = 0.15  # wrong by itself
-    cut = np.asarray(aggregate.cheapest(aggregate.semi_global(jnp.asarray(cost))))
+    cut = np.asarray(aggregate.cheapest(aggregate.semi_global(np.asarray(cost))))
     np.testing.assert_allclose(cut, truth, atol=0.05)
 
 
 def test_the_cut_between_cuts_is_a_parabola_s():
     k, least = np.arange(7.0), 3.3
     cost = np.square(k - least)[:, None, None]
-    assert float(aggregate.cheapest(jnp.asarray(cost))[0, 0]) == pytest.approx(least, abs=1e-5)
+    assert float(aggregate.cheapest(np.asarray(cost))[0, 0]) == pytest.approx(least, abs=1e-5)
     for end in (0.0, 6.0):  # no parabola at the ends
         cost = np.abs(k - end)[:, None, None]
-        assert float(aggregate.cheapest(jnp.asarray(cost))[0, 0]) == end
+        assert float(aggregate.cheapest(np.asarray(cost))[0, 0]) == end
 
 
 def test_enlarged_cuts_never_lie_between_two_surfaces():
     cut = np.full((6, 8), 3.0)
     cut[:, 4:] = 11.0
     cut[2, 1] = 4.0  # a slope on one surface is interpolated
-    big = np.asarray(aggregate.enlarged(jnp.asarray(cut), 18, 24)).round(4)
+    big = np.asarray(aggregate.enlarged(np.asarray(cut), 18, 24)).round(4)
     assert big.shape == (18, 24)
     assert np.all((big <= 4.0) | (big == 11.0)) and np.any((big > 3.0) & (big < 4.0))
     assert np.all(big[:, :11] <= 4.0) and np.all(big[:, 13:] == 11.0)
-    same = aggregate.enlarged(jnp.asarray(cut), 6, 8)
+    same = aggregate.enlarged(np.asarray(cut), 6, 8)
     np.testing.assert_allclose(same, cut)
 
 
@@ -81,7 +81,7 @@ def test_enlarged_edges_cut_corners():
     y, x = np.mgrid[:24, :32] + 0.5
     line = np.where(x + 0.6 * y < 22, 2.0, 9.0)
     cells = np.where(x[::4, ::4] + 1.5 + 0.6 * (y[::4, ::4] + 1.5) < 22, 2.0, 9.0)
-    big = np.asarray(aggregate.enlarged(jnp.asarray(cells), 24, 32)).round(4)
+    big = np.asarray(aggregate.enlarged(np.asarray(cells), 24, 32)).round(4)
     steps = cells.repeat(4, 0).repeat(4, 1)
     assert set(np.unique(big)) == {2.0, 9.0}
     assert (big != line).mean() < (steps != line).mean()
@@ -89,13 +89,17 @@ def test_enlarged_edges_cut_corners():
 
 def test_a_pyramid_gives_means_of_what_is_finer():
     photos = RNG.random((2, 16, 24, 3)).astype(np.float32)
-    pyramid = rendering.Pyramid.of(jnp.asarray(photos))
+
+    @compiled
+    def read_at(photos, x, y, level):
+        return rendering.Pyramid.of(photos).read(x, y, level)
+
     y, x = np.mgrid[2:14, 2:22] + 0.5
     x, y = (np.tile(z.reshape(1, -1), (2, 1)).astype(np.float32) for z in (x, y))
-    read = functools.partial(pyramid.read, *map(jnp.asarray, (x, y)))
-    sharp, half, quarter = (np.asarray(read(jnp.full(x.shape, k))) for k in (-3.0, 1.0, 9.0))
+    read = functools.partial(read_at, photos, x, y)
+    sharp, half, quarter = (np.asarray(read(np.full(x.shape, k))) for k in (-3.0, 1.0, 9.0))
     np.testing.assert_allclose(sharp, photos[:, 2:14, 2:22].reshape(2, -1, 3), atol=1e-5)
-    small = jax.image.resize(photos, (2, 8, 12, 3), "linear", antialias=True)
+    small = np.asarray(jax.image.resize(photos, (2, 8, 12, 3), "linear", antialias=True))
     np.testing.assert_allclose(
         half[:, [21]],
         small[:, [1], 1] * 0.5625
@@ -105,7 +109,7 @@ def test_a_pyramid_gives_means_of_what_is_finer():
         atol=1e-5,
     )
     assert np.std(quarter) < np.std(half) < 0.5 * np.std(sharp)
-    between = np.asarray(read(jnp.full(x.shape, 0.25)))
+    between = np.asarray(read(np.full(x.shape, 0.25)))
     np.testing.assert_allclose(between, 0.75 * sharp + 0.25 * half, atol=1e-5)
 
 
@@ -116,7 +120,7 @@ def whole(pictures: np.ndarray) -> rendering.Photos:
     scale = ones * np.array([h / H, w / W], np.float32)
     coarse = pictures.reshape(m, H, h // H, W, w // W, 3).mean((2, 4))
     size = ones * np.array([h, w], np.float32)
-    return rendering.Photos(*map(jnp.asarray, (pictures, coarse, size, scale, 0.0 * scale)))
+    return rendering.Photos(*map(np.asarray, (pictures, coarse, size, scale, 0.0 * scale)))
 
 
 def plane(size: int):
@@ -126,16 +130,16 @@ def plane(size: int):
     order = [1, 0, 2]
     K, c2w = K[order], c2w[order]
     cut = 8
-    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(cut), CUTS))
+    depth = 1.0 / float(sweep.inverse_depth(np.float32(cut), CUTS))
     scaled = K * np.array([size, size, 1.0], np.float32)[:, None]
     pictures = textured_plane(scaled, c2w, depth, size * H, size * W, 1.0 * size)
     blend = rendering.Blend(
-        inverse=jnp.full((1, H, W), 1.0 / depth),
-        step=jnp.full(1, 0.1),
-        share=jnp.full((1, 2, H, W, 1), 0.5),
-        gate=jnp.full((1, H, W, 1), 0.5),
-        head=jnp.full((1, H, W, 3), 0.5),
-        rest=jnp.zeros((1, H, W, 3)),
+        inverse=np.full((1, H, W), 1.0 / depth),
+        step=np.full(1, 0.1),
+        share=np.full((1, 2, H, W, 1), 0.5),
+        gate=np.full((1, H, W, 1), 0.5),
+        head=np.full((1, H, W, 3), 0.5),
+        rest=np.zeros((1, H, W, 3)),
     )
     way = sweep.motion(K[:1], c2w[:1], K[1:], c2w[1:])
     return pictures, way, blend
@@ -144,7 +148,7 @@ def plane(size: int):
 @pytest.mark.parametrize("size", [1, 3])
 def test_a_known_surface_is_as_sharp_as_its_photos(size):
     pictures, way, blend = plane(size)
-    scale = jnp.ones((1, 2))
+    scale = np.ones((1, 2))
     shown = rendering.render(
         whole(pictures[1:]), way, blend, scale, height=size * H, width=size * W
     )
@@ -162,18 +166,18 @@ def test_what_the_model_is_not_shown_of_a_photo_is_read_too():
     pictures, way, blend = plane(1)
     K, c2w = (x[[0]] for x in side_by_side(3, 0.15))
     top, left, extra = 3, 9, 40
-    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(8), CUTS))
+    depth = 1.0 / float(sweep.inverse_depth(np.float32(8), CUTS))
     wider = K + np.array([[0, 0, left], [0, 0, top], [0, 0, 0]], np.float32)
     photo = textured_plane(wider, c2w, depth, H + 6, W + extra)
     size, offset, one = (
         np.array([x], np.float32) for x in ((H + 6, W + extra), (top, left), (1, 1))
     )
-    more = rendering.Photos(*map(jnp.asarray, (photo, photo, size, one, offset)))
+    more = rendering.Photos(*map(np.asarray, (photo, photo, size, one, offset)))
     way = sweep.Motion(way.turn[:, :1], way.shift[:, :1])
-    blend = blend._replace(share=jnp.ones((1, 1, H, W, 1)))
+    blend = blend._replace(share=np.ones((1, 1, H, W, 1)))
     shape = {"height": H, "width": W}
     cut, uncut = (
-        np.asarray(rendering.render(x, way, blend, jnp.ones((1, 1)), **shape))[0]
+        np.asarray(rendering.render(x, way, blend, np.ones((1, 1)), **shape))[0]
         for x in (whole(pictures[1:2]), more)
     )
     np.testing.assert_allclose(uncut[:, :-18], cut[:, :-18], atol=0.03)
@@ -189,7 +193,7 @@ def test_where_no_photo_sees_anything_the_mixture_stays():
         whole(pictures[1:]),
         away,
         blend,
-        jnp.ones((1, 2)),
+        np.ones((1, 2)),
         height=2 * H,
         width=2 * W,
     )
@@ -199,7 +203,7 @@ def test_where_no_photo_sees_anything_the_mixture_stays():
 def test_photos_that_disagree_leave_the_picture_to_the_mixture():
     pictures, way, blend = plane(1)
     photos = np.stack([np.zeros_like(pictures[1]), np.ones_like(pictures[2])])
-    shown = rendering.render(whole(photos), way, blend, jnp.ones((1, 2)), height=H, width=W)
+    shown = rendering.render(whole(photos), way, blend, np.ones((1, 2)), height=H, width=W)
     middle = np.asarray(shown)[0, 2:-2, 18:-18]
     np.testing.assert_allclose(middle, 0.5, atol=0.02)
 
@@ -210,17 +214,15 @@ def test_look_up_gives_the_picture_at_both_sizes():
     K, c2w = side_by_side(3, 0.15)
     order = [1, 0, 2]
     K, c2w = K[order], c2w[order]
-    depth = 1.0 / float(sweep.inverse_depth(jnp.float32(8), CUTS))
+    depth = 1.0 / float(sweep.inverse_depth(np.float32(8), CUTS))
     big = textured_plane(K * np.array([3, 3, 1.0], np.float32)[:, None], c2w, depth, 3 * H, 3 * W)
     photos = big.reshape(3, H, 3, W, 3, 3).mean((2, 4))
     features = RNG.standard_normal((1, H // 8, W // 8, D)).astype(np.float32)
-    head = jnp.full((1, H, W, 3), 0.5)
-    given = (p, features, head, jnp.asarray(photos[1:]), (K[:1], c2w[:1]), (K[1:], c2w[1:]))
+    head = np.full((1, H, W, 3), 0.5)
+    given = (p, features, head, np.asarray(photos[1:]), (K[:1], c2w[:1]), (K[1:], c2w[1:]))
     full = lookup.Full(whole(big[1:]), 3 * H, 3 * W)
-    both = jax.jit(
-        lambda *a, photos: lookup.look_up(*a, cuts=CUTS, full=full._replace(photos=photos))
-    )(*given, photos=full.photos)
-    alone = jax.jit(functools.partial(lookup.look_up, cuts=CUTS))(*given)
+    both = lookup.look_up(*given, cuts=CUTS, full=full)
+    alone = lookup.look_up(*given, cuts=CUTS)
     assert alone.full is None and both.full.shape == (1, 3 * H, 3 * W, 3)
     for a, b in zip(alone[:4], both[:4]):
         np.testing.assert_allclose(a, b, atol=1e-5)
