@@ -25,6 +25,7 @@ _PUBLIC = {
     "load_path": ("scenes.paths", "load_path"),
     "save_path": ("scenes.paths", "save_path"),
     "plan": ("planning.plan", "plan"),
+    "step_through": ("core.stepping", "step_through"),
     "UserError": ("errors", "UserError"),
 }
 _MODULES = (

@@ -188,7 +188,14 @@ def weights_fingerprint(params: Tree, dtype: Any = None) -> str:
 
 
 def find_model(name: str | Path) -> Path:
-    """The folder of a model: a path, or the name of a shipped one."""
+    """The folder of a model: a path, the name of a shipped one, or `hub:USER/NAME`, which is fetched (`weights.hub`)."""
+    from .weights import hub
+
+    if hub.asks_hub(name):
+        load_config(
+            hub.fetch(str(name), ("config.json",))
+        )  # before gigabytes of something else come
+        return hub.fetch(str(name), ("config.json", "*.safetensors"))
     folder = Path(name)
     if is_file(folder / "config.json"):
         return folder
@@ -208,8 +215,9 @@ def find_model(name: str | Path) -> Path:
             f"No trained weights of preset '{name}' are here: convert the official ones with "
             f"`python -m roge_jax.convert`, or set {WEIGHTS_VARIABLE} to a folder that has '{name}/config.json'."
         )
+    there = f" A model of the Hugging Face hub is {hub.PREFIX}{name}." if hub.like_hub(name) else ""
     raise UserError(
-        f"Unknown checkpoint '{name}', neither a model folder nor a name: {did_you_mean(str(name), known)}"
+        f"Unknown checkpoint '{name}', neither a model folder nor a name: {did_you_mean(str(name), known)}{there}"
     )
 
 

@@ -47,7 +47,9 @@ def parser() -> argparse.ArgumentParser:
         default=[HELD_OUT],
         help=f"scene folders, 'motorcycle', procedural:SEED or procedural:FIRST..LAST\n(default: {HELD_OUT})",
     )
-    p.add_argument("--context", type=number(1), default=3, help="photos per scene (default: 3)")
+    p.add_argument(
+        "--context", type=number(1), default=3, help="how many photos per scene (default: 3)"
+    )
     p.add_argument(
         "--close",
         type=number(1),

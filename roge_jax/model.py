@@ -23,69 +23,25 @@ import numpy as np
 from . import fusion, preview
 from .config import RoGeConfig
 from .core.layers import resized
-from .core.lora import attach, lora_specs
-from .core.params import Spec, Tree, zeros
-from .core.params import init as init_specs
+from .core.lora import attach
+from .core.params import Tree
 from .core.params import split as split
 from .core.sharding import over_scenes
 from .fusion import Condition
 from .geometry.rays import plucker
+from .leaves import NEW_EMBEDDINGS as NEW_EMBEDDINGS
+from .leaves import RECONSTRUCTION as RECONSTRUCTION
+from .leaves import adapter_specs as adapter_specs
+from .leaves import init as init
+from .leaves import specs as specs
 from .recon import ray_scene, vggt
 from .recon.picture import decode_rgb as decode_rgb
 from .recon.picture import only_targets as only_targets
 from .recon.picture import recon_cameras, recon_photos, show, show_all
 from .recon.relative import Relative, relative_cameras
-from .video import dit, flow, solvers, vae, vae_training
+from .video import dit, flow, solvers, vae
 
 Views = dict[str, Any]
-
-# What trains when pretrained networks are adapted (Sec. 3.3): the new embeddings and E1 fully, the rest by LoRA.
-NEW_EMBEDDINGS = r"^fusion/|^dit/patch_embed/"
-
-
-# The half that makes pictures by itself: its parts of the parameter tree.
-RECONSTRUCTION = ("encoder", "renderer")
-
-
-def specs(config: RoGeConfig) -> Tree:
-    """Every leaf of the model, or of the half that `config.parts` names."""
-    tree = {
-        "encoder": vggt.encoder_specs(config.encoder, config.renderer.width),
-        "renderer": ray_scene.renderer_specs(config.renderer),
-        "vae": vae.vae_specs(config.vae),
-        "dit": dit.dit_specs(config.dit),
-        "fusion": fusion.fusion_specs(config),
-    }
-    if (
-        config.dit.text_len
-    ):  # the prompt's text embedding, zero-padded: text encoders are not needed afterwards
-        shape = (config.dit.text_len, config.dit.text_dim)
-        tree["prompt"] = {"rows": Spec(shape, (None, None), zeros)}
-    if config.parts == "all":
-        return tree
-    half = config.parts == "reconstruction"
-    return {name: part for name, part in tree.items() if (name in RECONSTRUCTION) == half}
-
-
-def init(key: jax.Array, config: RoGeConfig, *, make: Callable = init_specs) -> Tree:
-    """Random parameters (the VAE from its pass-through initialisation). With `make=params.drawn` all others are drawn
-    when they are asked for.
-    """
-    want = specs(config)
-    tree = make(key, {k: s for k, s in want.items() if k != "vae"})
-    if "vae" not in want:
-        return tree
-    return tree | {"vae": vae_training.passthrough_init(jax.random.fold_in(key, 1), config.vae)}
-
-
-def adapter_specs(config: RoGeConfig) -> Tree:
-    """The sparse tree of LoRA factors of both halves."""
-    tree, lora = specs(config), config.lora
-    recon = lora_specs(
-        {k: tree[k] for k in ("encoder", "renderer")}, lora.recon_rank, lora.recon_match
-    )
-    return {**recon, "dit": lora_specs(tree["dit"], lora.dit_rank, lora.dit_match)}
-
 
 # Reconstruction (Sec. 3.1).
 
@@ -260,7 +216,7 @@ def photometric(rgb: jax.Array, views: Views, *, config: RoGeConfig) -> jax.Arra
     return jnp.square(rgb - jnp.concatenate(truth)).mean()
 
 
-def flow_matching(
+def noised(
     params: Tree,
     x0: jax.Array,
     cond: Condition,
@@ -270,8 +226,8 @@ def flow_matching(
     contexts: int,
     remat: dit.Remat = "full",
     part: tuple[jax.Array | int, int] | None = None,
-) -> jax.Array:
-    """w(sigma) |M_t (V - (noise - x0))|^2, the mean over target latents, at one random noise level.
+) -> flow.Noised:
+    """Latents of all slots x0 [t, lh, lw, 16] at one random noise level, and their velocity.
 
     `part`: which part of the noise levels, see `flow.training_sigma`.
     """
@@ -281,24 +237,90 @@ def flow_matching(
     noise = jax.random.normal(key_noise, x0.shape)
     x = flow.x_sigma(x0, noise, sigma)
     v = velocity(params, x, sigma, cond, config=config, contexts=contexts, remat=remat)
-    error = (v - flow.velocity_target(x0, noise))[contexts:]
-    return (
-        flow.loss_weight(sigma, weighting=cfg.weighting, shift=cfg.shift) * jnp.square(error).mean()
-    )
+    return flow.Noised(sigma, noise, x, v, flow.denoised(x, v, sigma))
 
 
-def mean_flow_matching(
-    params: Tree, x0: jax.Array, cond: Condition, key: jax.Array, *, draws: int, **options
-) -> jax.Array:
-    """The mean of `flow_matching` over `draws` noise levels, one from each of as many equally likely parts."""
+def noised_draws(params: Tree, x0, cond: Condition, key, *, draws: int, **options) -> flow.Noised:
+    """`noised` at `draws` levels, one from each of as many equally likely parts: all arrays have that leading axis."""
+    keys = jax.random.split(key, draws)
     if draws == 1:
-        return flow_matching(params, x0, cond, jax.random.split(key, 1)[0], **options)
+        return jax.tree.map(lambda x: x[None], noised(params, x0, cond, keys[0], **options))
 
     def draw(key_and_part):
         key, part = key_and_part
-        return flow_matching(params, x0, cond, key, part=(part, draws), **options)
+        return noised(params, x0, cond, key, part=(part, draws), **options)
 
-    return jax.lax.map(draw, (jax.random.split(key, draws), jnp.arange(draws))).mean()
+    return jax.lax.map(draw, (keys, jnp.arange(draws)))
+
+
+def flow_error(
+    draws: flow.Noised, x0: jax.Array, *, config: RoGeConfig, contexts: int
+) -> jax.Array:
+    """The flow term of what `noised_draws` gives: w(sigma) |M_t (V - (noise - x0))|^2, the mean over the levels."""
+    cfg = config.flow
+    one = functools.partial(flow.error, contexts=contexts, weighting=cfg.weighting, shift=cfg.shift)
+    return jax.vmap(one, in_axes=(0, None))(draws, x0).mean()
+
+
+def flow_matching(
+    params: Tree, x0, cond: Condition, key, *, config, contexts: int, draws: int = 1, **options
+) -> jax.Array:
+    """The flow term of latents x0 [t, lh, lw, 16] under a condition; `options` are those of `noised`."""
+    common = {"config": config, "contexts": contexts}
+    found = noised_draws(params, x0, cond, key, draws=draws, **common, **options)
+    return flow_error(found, x0, **common)
+
+
+class Intermediates(NamedTuple):
+    """Every named quantity of one training sample: m contexts, n targets, t = m + 1 + (n - 1) / 4 latent slots.
+
+    The last five have a leading axis of noise levels, [1] unless `draws` asks for more. Contexts come first.
+    """
+
+    scene_tokens: jax.Array  # [m, l, d]
+    features: jax.Array  # [m + n, gh, gw, d]
+    rgb: jax.Array  # [m + n, recon_height, recon_width, 3], the reconstruction's picture
+    x0: jax.Array  # [t, lh, lw, 16]
+    condition: Condition
+    sigma: jax.Array  # [draws]
+    noise: jax.Array  # [draws, t, lh, lw, 16], and so are the next
+    x_sigma: jax.Array
+    velocity: jax.Array  # the network's; to be learned: noise - x0
+    predicted_x0: jax.Array  # x_sigma - sigma velocity
+
+    @property
+    def noised(self) -> flow.Noised:
+        """The part that belongs to noise levels."""
+        return flow.Noised(*(getattr(self, name) for name in flow.Noised._fields))
+
+
+def intermediates(
+    params: Tree,
+    views: Views,
+    key: jax.Array,
+    *,
+    config: RoGeConfig,
+    draws: int = 1,
+    remat: dit.Remat = "full",
+) -> Intermediates:
+    """What the loss of one scene is made of. What is not used costs nothing under `jax.jit`.
+
+    `draws` noise levels share one reconstruction and one encoding of the scene.
+    """
+    m = views["context_rgb"].shape[0]
+    tokens = reconstruct(params, views, config=config)
+    features = query_rays(params, tokens, views, config=config)
+    known = encode_contexts(params, views["context_rgb"], config=config)
+    made = encode_targets(params, views["target_rgb"], config=config)
+    x0 = jnp.concatenate([known, made])
+    rgb = decode_rgb(params, features, views, config=config)
+    cond = condition(params, x0[:m], features, views, config=config, shown=rgb[m:])
+    options = {"config": config, "contexts": m, "remat": remat}
+    found = noised_draws(params, x0, cond, key, draws=draws, **options)
+    return Intermediates(tokens, features, rgb, x0, cond, *found)
+
+
+Term = Callable[[Intermediates, Views], dict[str, jax.Array]]
 
 
 def scene_loss(
@@ -307,29 +329,17 @@ def scene_loss(
     key: jax.Array,
     *,
     config: RoGeConfig,
-    draws: int = 1,
-    remat: dit.Remat = "full",
+    more: Term | None = None,
+    **options,
 ) -> dict[str, jax.Array]:
-    """Both terms of the joint loss for one scene.
-
-    `draws` noise levels share one reconstruction and one encoding of the scene: the flow term is their mean.
-    """
+    """Both terms of the joint loss for one scene, and those of `more`; `options` are those of `intermediates`."""
+    found = intermediates(params, views, key, config=config, **options)
     m = views["context_rgb"].shape[0]
-    features = query_rays(params, reconstruct(params, views, config=config), views, config=config)
-    x0 = jnp.concatenate(
-        [
-            encode_contexts(params, views["context_rgb"], config=config),
-            encode_targets(params, views["target_rgb"], config=config),
-        ]
-    )
-    rgb = decode_rgb(params, features, views, config=config)
-    cond = condition(params, x0[:m], features, views, config=config, shown=rgb[m:])
-    return {
-        "flow": mean_flow_matching(
-            params, x0, cond, key, draws=draws, config=config, contexts=m, remat=remat
-        ),
-        "photometric": photometric(rgb, views, config=config),
+    terms = {
+        "flow": flow_error(found.noised, found.x0, config=config, contexts=m),
+        "photometric": photometric(found.rgb, views, config=config),
     }
+    return terms if more is None else terms | more(found, views)
 
 
 def loss(
@@ -341,18 +351,21 @@ def loss(
     config: RoGeConfig,
     draws: int = 1,
     remat: dit.Remat = "full",
+    more: Term | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """L = L_FM + lambda L_photometric, the mean over a batch of scenes (leading axis of every array), and its terms.
 
     `trainable` and `frozen` are sparse trees that together make the model; LoRA factors are leaves of `trainable`
-    beside the frozen kernels they adapt. What trains is therefore an argument.
+    beside the frozen kernels they adapt. What trains is therefore an argument. `more(intermediates, views)`: further
+    terms of one scene by name, which are added as they are; one of the two names takes that term's place.
     """
     params = attach(frozen, trainable)
     scenes = batch["K"].shape[0]
-    term = functools.partial(scene_loss, config=config, draws=draws, remat=remat)
+    term = functools.partial(scene_loss, config=config, draws=draws, remat=remat, more=more)
     terms = over_scenes(term, params, batch, jax.random.split(key, scenes))
     terms = {name: value.mean() for name, value in terms.items()}
-    return terms["flow"] + config.flow.photometric * terms["photometric"], terms
+    added = sum(value for name, value in terms.items() if name not in ("flow", "photometric"))
+    return terms["flow"] + config.flow.photometric * terms["photometric"] + added, terms
 
 
 # Sampling.
@@ -417,7 +430,7 @@ def generate(
     noise: jax.Array,
     *,
     config: RoGeConfig,
-    solver: "str | solvers.Table" = "euler",
+    solver: "str | solvers.Table | solvers.Sampler" = "euler",
     sigmas: np.ndarray | None = None,
     mode: flow.ContextSlots = "noised",
 ) -> tuple[jax.Array, solvers.SolveInfo]:

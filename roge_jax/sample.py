@@ -90,7 +90,8 @@ def parser() -> argparse.ArgumentParser:
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
     option("--size", "HEIGHTxWIDTH of the pictures; the model's own if not given")
-    option("--scale", "divisor of all positions; the model's rule if not given", type=real)
+    scale_help = "divisor of all positions, in units of the scene; the model's rule if not given"
+    option("--scale", scale_help, type=number(1e-30, whole=False))
     slots_help = "latents of photos while sampling: noised to the current level, clean, or free"
     option("--context-slots", slots_help, "noised", type=one_of(SLOTS))
     long_help = "long paths: chain (later windows see frames already made) or independent"

@@ -48,7 +48,7 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument("--steps", type=number(1), help="optimiser steps (default: the stage's own)")
     p.add_argument(
-        "--scale",
+        "--steps-scale",
         type=number(1e-6, 1e6, whole=False),
         default=1.0,
         help="multiplies the stage's own number of steps, of every stage of 'all'",
@@ -108,7 +108,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--context",
         type=number(1),
-        help="photos per scene that --dry-run counts (default: the most)",
+        help="how many photos a scene has that --dry-run counts (default: the most)",
     )
     p.add_argument(
         "--encode-once",
@@ -232,9 +232,9 @@ def choose(args: argparse.Namespace, cfg):
     if args.stage == "hires" or args.size:
         cfg = start.resize(cfg, args.size, hires=args.stage == "hires")
     size = (cfg.height, cfg.width)
-    recipe = stages_.mini_stages(args.scale, frames=cfg.frames, size=size)
+    recipe = stages_.mini_stages(args.steps_scale, frames=cfg.frames, size=size)
     for hires in (False, True):
-        steps = max(1, round(200 * args.scale))
+        steps = max(1, round(200 * args.steps_scale))
         stage = stages_.lora_stage(steps, frames=cfg.frames, hires=hires)
         small = count(model.specs(cfg)) < estimate.LARGE
         recipe.append(stages_.for_one_scene(stage) if small else stage)

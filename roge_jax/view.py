@@ -54,7 +54,7 @@ def parser() -> argparse.ArgumentParser:
         type=number(1e-3, 1000, whole=False),
     )
     option("--size", "HEIGHTxWIDTH of the videos; the model's own if not given")
-    scale_help = "divisor of all positions; the model's rule if not given"
+    scale_help = "divisor of all positions, in units of the scene; the model's rule if not given"
     option("--scale", scale_help, type=number(1e-30, whole=False))
     option(
         "--dtype",

@@ -224,7 +224,7 @@ def test_the_loss_ignores_context_slots():
     assert float(flow_term(p, x0.at[M:].add(7.0), cond, key)) != float(got)
 
     # The same number from the definition, with the draws of the same key.
-    key_sigma, key_noise = jax.random.split(key)
+    key_sigma, key_noise = jax.random.split(jax.random.split(key, 1)[0])
     sigma = flow.training_sigma(
         key_sigma, method=CONFIG.flow.sigma_sampling, shift=CONFIG.flow.shift
     )
@@ -240,20 +240,90 @@ def test_the_noise_levels_of_a_step_are_one_from_each_part(monkeypatch):
     """The mean over 40 levels hardly varies between keys; that of 40 free draws would by 0.04."""
 
     def level(params, x0, cond, key, *, config, contexts, part=None):
-        return flow.training_sigma(key, shift=config.flow.shift, part=part)
+        sigma = flow.training_sigma(key, shift=config.flow.shift, part=part)
+        return flow.Noised(sigma, x0, x0, x0, x0)
 
-    monkeypatch.setattr(model, "flow_matching", level)
+    monkeypatch.setattr(model, "noised", level)
     options = {"config": CONFIG, "contexts": M}
-    means = [
-        model.mean_flow_matching({}, None, None, jax.random.key(i), draws=40, **options)
-        for i in range(8)
-    ]
+
+    def mean(i, draws):
+        found = model.noised_draws(
+            {}, jnp.zeros(()), None, jax.random.key(i), draws=draws, **options
+        )
+        assert found.sigma.shape == (draws,)
+        return float(found.sigma.mean())
+
+    means = [mean(i, 40) for i in range(8)]
     assert 0.0 < np.std(means) < 0.01
-    ones = [
-        float(model.mean_flow_matching({}, None, None, jax.random.key(i), draws=1, **options))
-        for i in range(8)
-    ]
-    assert np.std(ones) > 0.05
+    assert np.std([mean(i, 1) for i in range(8)]) > 0.05
+
+
+# Every named quantity of a training sample.
+
+
+def distance(found, views):
+    """Another term, in five lines: how far the latents that the velocity implies are from the true ones."""
+    m = len(views["context_rgb"])
+    return {"x0": 0.1 * jnp.abs(found.predicted_x0 - found.x0[None])[:, m:].mean()}
+
+
+@functools.cache
+def looked_at(draws=2):
+    trainable, frozen = parts()
+    views = jax.tree.map(lambda x: x[0], batch(0))
+
+    @jax.jit
+    def run(trainable, frozen, views, key):
+        params = attach(frozen, trainable)
+        options = {"config": CONFIG, "draws": draws, "remat": "none"}
+        found = model.intermediates(params, views, key, **options)
+        return found, model.scene_loss(params, views, key, more=distance, **options)
+
+    return views, *run(trainable, frozen, views, jax.random.key(5))
+
+
+def test_intermediates_are_what_their_names_say():
+    views, found, _ = looked_at()
+    v, latents = M + N, (SLOTS, *CONFIG.latent_size, CONFIG.vae.latent)
+    assert found.scene_tokens.shape[0] == M and found.features.shape[0] == v
+    assert found.rgb.shape == (v, CONFIG.recon_height, CONFIG.recon_width, 3)
+    assert found.x0.shape == latents and found.sigma.shape == (2,)
+    assert {x.shape for x in found[-4:]} == {(2, *latents)}
+    sigma = np.asarray(found.sigma)[:, None, None, None, None]
+    assert (sigma > 0).all() and sigma[0] != sigma[1]
+    x0, noise, x, velocity = (np.asarray(a) for a in (found.x0, *found[-4:-1]))
+    np.testing.assert_allclose(x, (1 - sigma) * x0 + sigma * noise, atol=1e-5)
+    np.testing.assert_allclose(found.predicted_x0, x - sigma * velocity, atol=1e-5)
+    known = model.encode_contexts(whole(), views["context_rgb"], config=CONFIG)
+    np.testing.assert_allclose(x0[:M], known, atol=1e-5)
+
+
+def test_the_terms_are_made_of_the_intermediates_and_another_one_is_added():
+    views, found, terms = looked_at()
+    off = np.square(np.asarray(found.velocity) - (np.asarray(found.noise) - np.asarray(found.x0)))
+    cfg = CONFIG.flow
+    weight = flow.loss_weight(found.sigma, weighting=cfg.weighting, shift=cfg.shift)
+    want = (np.asarray(weight) * off[:, M:].mean((1, 2, 3, 4))).mean()
+    np.testing.assert_allclose(terms["flow"], want, rtol=1e-5)
+    photometric = model.photometric(found.rgb, views, config=CONFIG)
+    np.testing.assert_allclose(terms["photometric"], photometric, rtol=1e-5)
+    np.testing.assert_allclose(terms["x0"], distance(found, views)["x0"], rtol=1e-5)
+    assert terms["x0"] > 0
+
+
+def test_another_term_is_added_to_the_loss(monkeypatch):
+    given = {"flow": jnp.float32(2.0), "photometric": jnp.float32(10.0)}
+    monkeypatch.setattr(
+        model,
+        "scene_loss",
+        lambda *_, more, **__: given | ({} if more is None else more(None, None)),
+    )
+    one = {"K": jnp.zeros((1, 3, 3))}
+    total = {
+        more: model.loss({}, {}, one, jax.random.key(0), config=CONFIG, more=more)[0]
+        for more in (None, lambda found, views: {"mine": jnp.float32(0.5)})
+    }
+    np.testing.assert_allclose(list(total.values()), [3.0, 3.5])
 
 
 # Symmetry of the context slots.

@@ -103,7 +103,7 @@ def clip_loss(params: Tree, clip, key, *, config: RoGeConfig) -> jax.Array:
     """The stage's flow-matching loss of one encoded clip: `DRAWS` noise levels share one condition."""
     cond = condition(params, clip, config)
     options = {"config": config, "contexts": CONTEXTS, "remat": "none"}
-    return model.mean_flow_matching(params, clip["x0"], cond, key, draws=DRAWS, **options)
+    return model.flow_matching(params, clip["x0"], cond, key, draws=DRAWS, **options)
 
 
 def train(variant: Variant, frozen: Frozen, steps: int) -> dict[str, Any]:

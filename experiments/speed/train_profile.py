@@ -55,7 +55,7 @@ def profile(checkpoint: str, size: str, photos: int, repeats: int, seed: int) ->
         shown = rgb[photos:]
         cond = model.condition(p, x0[:photos], features, views, config=working, shown=shown)
         options = {"config": working, "contexts": photos, "remat": stage.remat}
-        return model.mean_flow_matching(p, x0, cond, key, draws=stage.draws, **options)
+        return model.flow_matching(p, x0, cond, key, draws=stage.draws, **options)
 
     compile_seconds, compiled = {}, {}
 

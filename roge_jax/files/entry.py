@@ -30,6 +30,7 @@ from ..errors import UserError, did_you_mean
 _PACKAGE = __package__.partition(".")[0]
 
 CACHE_VARIABLE = "ROGE_CACHE"  # a folder for compiled programs, or "off"
+DEBUG_VARIABLE = "ROGE_DEBUG"  # 1: nothing is compiled, and mistakes show where they come from
 LESS = "ask for less, e.g. fewer frames or photos or a smaller size (--dry-run tells what a run needs)."
 REMEDIES = {
     errno.ENOSPC: "free some space or give another --out",
@@ -73,7 +74,7 @@ def execute(
     that `main` returns is the exit code. Warnings are printed as one line each.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    debug = "--debug" in arguments
+    debug = "--debug" in arguments or step_through()
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal cannot show is escaped
         with contextlib.suppress(AttributeError, ValueError, OSError):
             stream.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
@@ -112,6 +113,16 @@ def execute(
             if (missing := _missing_platform()) is None:
                 raise
             return _report(missing, 2, debug)
+
+
+def step_through() -> bool:
+    """Whether ROGE_DEBUG asks for it; JAX then compiles nothing and runs loops in Python (`core.stepping`)."""
+    if os.environ.get(DEBUG_VARIABLE, "0") in ("", "0"):
+        return False
+    os.environ["JAX_DISABLE_JIT"] = "1"
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_disable_jit", True)
+    return True
 
 
 def _missing_platform() -> UserError | None:

@@ -40,11 +40,12 @@ class Option(NamedTuple):
 def full_choices(photos: Photos, config: RoGeConfig, path: Cameras, settings: Settings) -> Choices:
     """Nothing left out."""
     settings = settings.of(config)
+    solver, schedule = settings.names()
     return Choices(
         photos=tuple(range(len(photos.ids))),
         steps=settings.steps,
-        solver=settings.solver,
-        schedule=settings.schedule,
+        solver=solver,
+        schedule=schedule,
         recon=(config.recon_height, config.recon_width),
         merge=config.renderer.merge,
         generate=tuple(windows(len(path), config.frames)),
@@ -137,9 +138,10 @@ def _photo_sets(worth: np.ndarray) -> list[tuple[tuple[int, ...], float | None]]
 
 def _evaluations(settings: Settings) -> int:
     """Of the network, per window; three per step is a guess for solvers that choose their own."""
-    if solvers.SOLVERS[settings.solver].method is None:
+    solver, _ = settings.names()
+    if solvers.SOLVERS[solver].method is None:
         return 3 * settings.steps
-    return solvers.nfe(settings.solver, settings.steps)
+    return solvers.nfe(solver, settings.steps)
 
 
 class Prices:

@@ -32,6 +32,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
+from ..core.stepping import checkpoint
 from .depth import FINER, levels_of, surfaces
 from .matching import matching_specs
 from .rendering import Blend, Photos, render
@@ -158,7 +159,7 @@ def look_up(
     match = p.get("match")
     levels = None if full is None else levels_of(match, full.photos)
 
-    @jax.checkpoint
+    @checkpoint
     def one(way, prior, context, head, far):
         reach = shared_reach(way, alike, maps.shape[1:3], CELL, cuts)
         around = _agreement_around(halves, alike, way, reach, cuts)

@@ -25,6 +25,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, fan_in, normal, stack, zeros
 from ..core.sharding import constrain, ways
+from ..core.stepping import checkpoint
 from .lookup import lookup_specs
 from .relative import Relative, inside, to_key, to_output, to_query
 
@@ -271,7 +272,7 @@ def query_rays(
 
         # Every block is checkpointed already; the outer one keeps a single chunk's blocks in memory at a time.
         x, out = jax.lax.map(
-            jax.checkpoint(lambda args: some(*args)),
+            checkpoint(lambda args: some(*args)),
             tuple(split(t) for t in (plucker, project, unproject)),
         )
         x = jnp.swapaxes(x, 0, 1).reshape(chunks * cfg.chunk, *x.shape[2:])[:v]
@@ -291,7 +292,7 @@ def _query(p, z, levels, plucker, *, cfg, rays, cameras, collect):
             y = jax.tree.map(lambda t: constrain(t, ("views", None, None)), step(carry, p))
             return y, y if collect else None
 
-        return jax.checkpoint(per_view)
+        return checkpoint(per_view)
 
     if cfg.attention == "full":
 
@@ -342,7 +343,7 @@ def shared_levels(p, z, plucker, *, cfg, rays, cameras):
     registers = p["registers"].astype(jnp.float32)
     x = jnp.concatenate([jnp.broadcast_to(registers[None], (x.shape[0], *registers.shape)), x], 1)
 
-    @jax.checkpoint
+    @checkpoint
     def step(carry, p):
         x, z = carry
         zn = _norm(p["norm_scene"], z)

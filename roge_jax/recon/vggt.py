@@ -26,6 +26,7 @@ from ..core.layers import (
 )
 from ..core.params import Spec, Tree, constant, fan_in, normal, ones, stack
 from ..core.rope import grid_angles, rotate_halves
+from ..core.stepping import checkpoint
 from .relative import Relative, relative_cameras, to_key, to_output, to_query
 
 IMAGE_MEAN, IMAGE_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
@@ -131,7 +132,7 @@ def dino(p: Tree, images: jax.Array, *, cfg: EncoderConfig) -> tuple[jax.Array, 
     lead = jnp.concatenate([first[None], p["register_tokens"].astype(jnp.float32)])
     x = jnp.concatenate([jnp.broadcast_to(lead[None], (v, *lead.shape)), tokens], 1)
     out = {"pos_embed": positions, "tokens_in": x}
-    step = jax.checkpoint(lambda x, p: (block(p, x, dino_heads(cfg), eps=DINO_EPS), None))
+    step = checkpoint(lambda x, p: (block(p, x, dino_heads(cfg), eps=DINO_EPS), None))
     x, _ = jax.lax.scan(step, x, p["blocks"])
     out["prenorm"] = x
     x = layer_norm(p["norm"], x, eps=DINO_EPS)
@@ -232,7 +233,7 @@ def aggregate(
             x.shape
         )
 
-    @jax.checkpoint
+    @checkpoint
     def pair(carry, p):
         frame, overall = p
         x = block(

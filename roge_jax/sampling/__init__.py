@@ -6,6 +6,7 @@ __getattr__, __dir__ = submodules(
     __name__,
     choices=("Choices", "Planned"),
     photos=("Photos", "blank_scene", "context_ids", "read_photos"),
+    windows=("make_views",),
     reconstruction=("encode", "look", "preview"),
     video=(
         "Result",

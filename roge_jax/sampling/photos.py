@@ -35,6 +35,16 @@ class Photos(NamedTuple):
         return Photos(self.images[kept], recon, self.cameras[kept], ids, full)
 
 
+def check_photos(photos: Photos, config: RoGeConfig) -> None:
+    """Raise UserError for photos of another size than the model's."""
+    wanted = (len(photos.ids), config.height, config.width, 3)
+    if np.shape(photos.images) != wanted or len(photos.cameras) != wanted[0]:
+        raise UserError(
+            f"Photos of shape {np.shape(photos.images)} with {len(photos.cameras)} cameras for {wanted[0]} ids do not "
+            f"fit a model of {config.height}x{config.width} ({config.name}): make them with sampling.read_photos."
+        )
+
+
 def context_ids(
     text: str | None, scene: Scene, config: RoGeConfig, path: Cameras | None = None
 ) -> list[int]:

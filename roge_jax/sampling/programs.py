@@ -15,6 +15,7 @@ from .. import model
 from ..config import RoGeConfig
 from ..core import sharding
 from ..core.params import Tree
+from ..core.stepping import stepping
 from ..recon.picture import decode_all
 from ..video import flow
 
@@ -71,12 +72,14 @@ def for_window(
     """
     m, whole = views["context_rgb"].shape[0], sharding.everywhere()
     fix, jit = functools.partial, functools.partial(jax.jit, out_shardings=whole)
-    pieces = {
-        "prepare": jit(fix(model.prepare if rest is None else prepare_stretch, config=config)),
-        "velocity": jit(fix(velocity, config=config, slots=slots)),
-        "decode": jit(fix(decode, config=config, contexts=m)),
+    plain: dict[str, Callable] = {
+        "prepare": fix(model.prepare if rest is None else prepare_stretch, config=config),
+        "velocity": fix(velocity, config=config, slots=slots),
+        "decode": fix(decode, config=config, contexts=m),
     }
-
+    if stepping():
+        return Programs(**plain)
+    pieces = {name: jit(piece) for name, piece in plain.items()}
     shapes = sharding.shapes
     weights = shapes(params)
     seen = [shapes(some) for some in (views, rest) if some is not None]
@@ -124,5 +127,8 @@ def for_preview(
     params: Tree, views: model.Views, config: RoGeConfig, slots: flow.ContextSlots
 ) -> PreviewProgram:
     """`for_window`, where the window is not generated."""
-    piece = jax.jit(functools.partial(rgb_head, config=config))
+    shown = functools.partial(rgb_head, config=config)
+    if stepping():
+        return PreviewProgram(shown)
+    piece = jax.jit(shown)
     return PreviewProgram(piece.lower(params, views).compile())

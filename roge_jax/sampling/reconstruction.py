@@ -21,6 +21,7 @@ from .. import cost, model
 from ..config import RoGeConfig
 from ..core import sharding, target
 from ..core.params import Tree
+from ..core.stepping import stepping
 from ..errors import UserError
 from ..geometry.cameras import Cameras, Normalisation, normalise, to_host
 from ..geometry.packing import pad_path
@@ -108,7 +109,10 @@ def of_photos(
 
 def encoder(params: Tree, views: model.Views, config: RoGeConfig) -> Callable:
     """(params, views) -> `Known`, compiled for these shapes."""
-    program = jax.jit(functools.partial(_known, config=config))
+    known = functools.partial(_known, config=config)
+    if stepping():
+        return known
+    program = jax.jit(known)
     return program.lower(*sharding.shapes((params, views))).compile()
 
 
@@ -159,6 +163,8 @@ def compiled(
     """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
     shapes: list[Any] = [((count, n, n), jnp.float32) for n in (3, 4)]
     shapes += [] if photos is None else [((photos,), jnp.int32)]
+    if stepping():
+        return functools.partial(look, config=config)
     where = sharding.everywhere()
     cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)
     program = jax.jit(functools.partial(look, config=config), out_shardings=sharding.everywhere())

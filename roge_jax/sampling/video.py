@@ -16,7 +16,7 @@ import dataclasses
 import functools
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +26,20 @@ from .. import model
 from ..config import RoGeConfig
 from ..core import sharding
 from ..core.params import Tree
-from ..errors import UserError, did_you_mean
-from ..files import fields
+from ..errors import UserError
 from ..geometry.cameras import Cameras, Normalisation, concatenate, normalise, to_host
 from ..geometry.crops import scale_K
-from ..video import flow, solvers
 from . import limits, programs
 from .choices import Choices, Planned, around, spans
 from .photos import Photos
+from .photos import check_photos as check_photos
+from .settings import LONG as LONG
+from .settings import SLOTS as SLOTS
+from .settings import Settings as Settings
+from .settings import noise_levels as noise_levels
+from .steps import Bar as Bar
+from .steps import integrate as integrate
+from .steps import started
 from .whole import Whole
 from .windows import (
     chain_views,
@@ -46,59 +52,7 @@ from .windows import (
 )
 
 NOTHING_TO_PLAN = "A reconstruction alone has no generator to spare: sample without a plan."
-LONG = ("chain", "independent")
-SLOTS = ("noised", "clean", "free")
-
 Stage = Callable[[str], AbstractContextManager]
-
-
-class Bar(Protocol):
-    """What is told how far a video is: tqdm's bars are such."""
-
-    def reset(self, total: float | None = None) -> Any: ...
-
-    def update(self, n: float = 1) -> Any: ...
-
-    def set_description(self, desc: str) -> Any: ...
-
-    def close(self) -> Any: ...
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How to sample; all of it goes into run.json. Steps 0, no solver, no schedule: the model's own (`of`)."""
-
-    steps: int = 0
-    solver: str = ""
-    schedule: str = ""
-    seed: int = 0
-    slots: flow.ContextSlots = "noised"
-    long: Literal["chain", "independent"] = "chain"
-    scale: float | None = None  # divisor of all positions, in scene units; None: the model's rule
-
-    def __post_init__(self):
-        for name, word, allowed in (
-            ("solver", self.solver or "euler", tuple(solvers.SOLVERS)),
-            ("context slots", self.slots, SLOTS),
-            ("long", self.long, LONG),
-        ):
-            if word not in allowed:
-                raise UserError(f"Unknown {name} '{word}': {did_you_mean(word, allowed)}")
-        fields.number(self.seed, "Settings", "seed", low=0, whole=True)
-        if self.scale is not None:
-            fields.number(self.scale, "Settings", "scale", low=1e-30)
-        if self.schedule != "optimised":  # those belong to a model, which `sample` knows
-            flow.schedule(self.schedule or "uniform", self.steps or 1)
-
-    def of(self, config: RoGeConfig) -> "Settings":
-        """These settings with what they leave open as the model's configuration has it."""
-        own = config.flow
-        return dataclasses.replace(
-            self,
-            steps=self.steps or own.steps,
-            solver=self.solver or own.solver,
-            schedule=self.schedule or own.schedule,
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,16 +69,6 @@ class Result:
     # {"rgb_head": [[first, last], ...]}, the frames that are not generated
     windows: tuple[dict[str, Any], ...]
     warnings: tuple[limits.Beyond, ...] = ()  # beyond what the model was measured to stand
-
-
-def check_photos(photos: Photos, config: RoGeConfig) -> None:
-    """Raise UserError for photos of another size than the model's."""
-    wanted = (len(photos.ids), config.height, config.width, 3)
-    if np.shape(photos.images) != wanted or len(photos.cameras) != wanted[0]:
-        raise UserError(
-            f"Photos of shape {np.shape(photos.images)} with {len(photos.cameras)} cameras for {wanted[0]} ids do not "
-            f"fit a model of {config.height}x{config.width} ({config.name}): make them with sampling.read_photos."
-        )
 
 
 # ---- compiled pieces -----------------------------------------------------------------------------
@@ -154,23 +98,12 @@ def reduced(
     return photos, config, settings
 
 
-def noise_levels(settings: Settings, config: RoGeConfig) -> np.ndarray:
-    """The noise levels [steps + 1] of settings that leave nothing open (`Settings.of`)."""
-    return flow.schedule(
-        settings.schedule,
-        settings.steps,
-        shift=config.flow.shift,
-        solver=settings.solver,
-        model=config.name,
-    )
-
-
 def sample(
     params: Tree,
     config: RoGeConfig,
     photos: Photos,
     path: Cameras,
-    settings: Settings = Settings(),
+    settings: Settings | None = None,
     *,
     stage: Stage | None = None,
     plan: Planned | None = None,
@@ -189,6 +122,7 @@ def sample(
     Raises: UserError for what cannot be done; `solvers.SamplingError` at the first number that is not finite.
     """
     stage = stage or (lambda name: nullcontext())
+    settings = settings or Settings()
     cache = {} if cache is None else cache
     if config.parts != "all":
         from . import reconstruction  # it imports this module, and refuses a generator alone
@@ -219,7 +153,7 @@ def sample(
     grid = noise_levels(settings, config)
     runs = windows(len(path), config.frames)
     made, length = spans(plan, runs, config.frames)
-    bar = _bar(progress, settings, grid, sum(first < last for first, last in made))
+    bar = started(progress, settings, grid, sum(first < last for first, last in made))
     frames: list[np.ndarray] = []
     previews: list[np.ndarray] = []
     told: list[dict[str, Any]] = []
@@ -369,53 +303,5 @@ def _seen_later(
     )
 
 
-def integrate(
-    run: programs.Programs,
-    params,
-    prepared,
-    noise,
-    grid,
-    settings: Settings,
-    config: RoGeConfig,
-    bar,
-):
-    """(latents of all slots, evaluations): noise to sample, one evaluation per step of the bar."""
-    if solvers.SOLVERS[settings.solver].method is None:  # adaptive: one program, no steps to show
-
-        @jax.jit
-        def whole(params, prepared, noise):
-            def field(x, sigma):
-                return programs.velocity(
-                    params, prepared, noise, x, sigma, config=config, slots=settings.slots
-                )
-
-            return solvers.solve(settings.solver, field, noise, grid)
-
-        x0, info = whole(params, prepared, noise)
-        solvers.raise_if_failed(info)
-        bar.update(int(info.evaluations))
-        return x0, int(info.evaluations)
-
-    def field(x, sigma):
-        return run.velocity(params, prepared, noise, x, sigma)
-
-    done, x = 0, noise
-    for count, _, state in solvers.iterate(settings.solver, field, noise, grid):
-        bar.update(1)
-        done, x = count, state
-    return jax.block_until_ready(x), done
-
-
 def _enlarged(images: np.ndarray, height: int, width: int) -> np.ndarray:
     return np.asarray(model.resized(jnp.asarray(images), height, width))
-
-
-def _bar(progress: bool | Bar, settings: Settings, grid: np.ndarray, runs: int) -> Bar:
-    from tqdm import tqdm
-
-    fixed = solvers.SOLVERS[settings.solver].method is not None
-    total = runs * len(solvers.tabulate(settings.solver, grid).sigma) if fixed else None
-    if not isinstance(progress, bool):
-        progress.reset(total)
-        return progress
-    return tqdm(total=total, desc="sampling", unit="step", disable=not progress, dynamic_ncols=True)

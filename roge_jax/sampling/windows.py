@@ -8,8 +8,17 @@ import numpy as np
 
 from .. import model
 from ..config import RoGeConfig
-from ..geometry.cameras import Cameras, Normalisation, camera_vector, concatenate, to_host
+from ..errors import UserError
+from ..geometry.cameras import (
+    Cameras,
+    Normalisation,
+    camera_vector,
+    concatenate,
+    normalise,
+    to_host,
+)
 from ..geometry.packing import GROUP, pad_path
+from .photos import Photos, check_photos
 from .whole import Whole
 
 CHAIN_FRAMES = 2  # frames already made that join as contexts, where the model takes that many
@@ -87,6 +96,33 @@ def window_views(
     if full is not None:
         views["full"] = full.arrays()
     return views
+
+
+def make_views(
+    photos: Photos,
+    path: Cameras,
+    config: RoGeConfig,
+    *,
+    scale: float | None = None,
+    full: bool = False,
+) -> tuple[model.Views, Normalisation]:
+    """Photos and a path to what every function of `model` takes: (views, the frame that they are in).
+
+    photos: of `read_photos`. path: cameras [n] in the scene's frame, K in pixels of config.height x config.width, at most
+    a chunk; a shorter one is padded to `config.frames`. scale: a divisor of all positions; the model's rule if None.
+    full: the photos whole besides, for pictures larger than the model's (`config.output`).
+    Contexts come first; `Normalisation.apply` brings further cameras into the frame.
+    Raises: UserError for a path that is longer or empty, photos of another size, or cameras that are none.
+    """
+    check_photos(photos, config)
+    if not 1 <= len(path) <= config.frames:
+        raise UserError(
+            f"A path of {len(path)} frames is no single chunk of {config.frames}: give a part of it, or make the video with "
+            "sampling.sample, which goes chunk by chunk."
+        )
+    context, target, info = normalise(photos.cameras, path, rule=config.scale_rule, scale=scale)
+    seen, whole = (photos.images, photos.recon, context), photos.full if full else None
+    return window_views(*seen, target, info, config, full=whole), info
 
 
 def window_noise(seed: int, window: int, contexts: int, config: RoGeConfig) -> np.ndarray:

@@ -71,11 +71,11 @@ def condition(params: Tree, clip: Clip, *, config: RoGeConfig) -> fusion.Conditi
 def flow_term(
     params: Tree, clip: Clip, key: jax.Array, *, config: RoGeConfig, **options
 ) -> jax.Array:
-    """`model.mean_flow_matching` of an encoded sample; `options` are its draws and remat."""
+    """`model.flow_matching` of an encoded sample; `options` are its draws and remat."""
     contexts = len(clip["x0"]) - config.slots(0)
     with jax.named_scope("condition"):
         cond = condition(params, clip, config=config)
-    return model.mean_flow_matching(
+    return model.flow_matching(
         params, clip["x0"], cond, key, config=config, contexts=contexts, **options
     )
 

@@ -95,7 +95,7 @@ def prior_objective(trainable, frozen, batch, key, *, config, stage):
         x0 = jax.lax.stop_gradient(jnp.concatenate(latents))
         cond = fusion.unconditioned(x0[:m], x0.shape[0], config)
         options = {"config": config, "contexts": m, "remat": stage.remat}
-        return model.mean_flow_matching(params, x0, cond, key, draws=stage.draws, **options)
+        return model.flow_matching(params, x0, cond, key, draws=stage.draws, **options)
 
     keys = jax.random.split(key, batch["K"].shape[0])
     loss = model.over_scenes(scene, params, batch, keys).mean()

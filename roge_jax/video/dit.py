@@ -30,6 +30,7 @@ from ..core.layers import (
 from ..core.params import Spec, Tree, normal, stack, uniform, zeros
 from ..core.rope import frequencies, rotate_pairs
 from ..core.sharding import by_heads, constrain
+from ..core.stepping import checkpoint
 
 Split = Literal["image_first", "text_last"]
 Remat = Literal["none", "dots", "attention", "full"]
@@ -284,7 +285,7 @@ def rematerialise(f, remat: Remat):
     (attention), all but products with weights and attention in pieces (dots), or nothing (none)."""
     if remat == "none":
         return f
-    return jax.checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
+    return checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
 
 
 def dit_blocks(

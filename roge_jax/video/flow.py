@@ -12,7 +12,7 @@ made on the host, so that they are checked before anything is compiled.
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -130,6 +130,24 @@ def loss_weight(sigma: Array, *, weighting: str = "bump", shift: float = 5.0) ->
     total = float(np.sum(_bump(training_table(shift, "uniform")[0])))
     bump = jnp.exp(-2.0 * (sigma - 0.5) ** 2) - float(np.exp(-0.5))
     return jnp.maximum(bump, 0.0) * (TRAIN_POINTS / total)
+
+
+class Noised(NamedTuple):
+    """Latents of all slots [t, lh, lw, c] at a noise level, and what the network makes of them."""
+
+    sigma: Array  # []
+    noise: Array
+    x_sigma: Array  # what the network saw
+    velocity: Array  # what it said
+    predicted_x0: Array  # the clean latents that this implies
+
+
+def error(
+    noised: Noised, x0: Array, *, contexts: int, weighting: str = "bump", shift: float = 5.0
+) -> Array:
+    """w(sigma) |V - (noise - x0)|^2, the mean over target latents: those after the first `contexts` slots."""
+    off = (noised.velocity - velocity_target(x0, noised.noise))[contexts:]
+    return loss_weight(noised.sigma, weighting=weighting, shift=shift) * jnp.square(off).mean()
 
 
 def training_sigma(

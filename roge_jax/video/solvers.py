@@ -34,6 +34,7 @@ from roge_jax.video.solver_table import SOLVERS, Table, check_grid, nfe, tabulat
 
 __all__ = [
     "SOLVERS",
+    "Sampler",
     "SamplingError",
     "SolveInfo",
     "Table",
@@ -48,6 +49,8 @@ __all__ = [
 
 Velocity = Callable[[Array, Array], Array]
 Project = Callable[[Array, Array], Array]
+# A sampler of one's own: (velocity(x, sigma), x at grid[0], grid [steps + 1]) -> x at grid[-1].
+Sampler = Callable[[Velocity, Array, np.ndarray], Array]
 
 
 def guided(
@@ -80,7 +83,7 @@ def guided(
 
 
 def solve(
-    solver: str | Table,
+    solver: str | Table | Sampler,
     velocity: Velocity,
     x1: Array,
     sigmas: np.ndarray | None = None,
@@ -94,7 +97,8 @@ def solve(
 ) -> tuple[Array, SolveInfo]:
     """Integrate from `x1` at sigmas[0] to sigmas[-1]; returns (x0, info).
 
-    `solver`: a name of SOLVERS with a grid `sigmas` [n + 1], or a Table (which holds its grid).
+    `solver`: a name of SOLVERS with a grid `sigmas` [n + 1], a Table (which holds its grid), or a function of one's own,
+    a `Sampler`, with a grid; `info.evaluations` is then -1: nobody counts them.
     `breaks`: noise levels where the field jumps (guidance ends); grid points, see `schedule`.
     `project(x, sigma)`: applied to the state before each evaluation at that evaluation's sigma,
     and to the result; RoGe holds context slots at the known latents with it.
@@ -117,6 +121,9 @@ def solve(
             max_evaluations=max_evaluations,
         )
         return x, info
+    if not isinstance(solver, str | Table):
+        assert sigmas is not None and not keep_states
+        return _by_own(solver, velocity, x1.astype(dtype), check_grid(sigmas, breaks), project)
     table = _table(solver, sigmas, breaks)
     stored = _start(table, x1.astype(dtype))
 
@@ -167,6 +174,22 @@ def iterate(
     x0, info = _finish(table, stored, info, project)
     raise_if_failed(info)
     yield count, count, x0
+
+
+def _by_own(sampler: Sampler, velocity: Velocity, x1: Array, grid: np.ndarray, project):
+    """`solve` by a function that knows nothing of `project`."""
+
+    def held(x: Array, sigma) -> Array:
+        return x if project is None else project(x, sigma).astype(x1.dtype)
+
+    def field(x: Array, sigma) -> Array:
+        sigma = jnp.asarray(sigma, jnp.float32)
+        return velocity(held(x, sigma), sigma)
+
+    end = jnp.float32(grid[-1])
+    x0 = held(sampler(field, x1, grid), end)
+    info = replace(fresh_info(x1.size, x1.dtype), evaluations=jnp.int32(-1))
+    return x0, note(info, x0, BAD_STATE, len(grid) - 1, end)
 
 
 # ---- one evaluation ------------------------------------------------------------------------------

@@ -21,6 +21,9 @@ assert tokens.shape[0] == m == 2 and slope.shape == (m + config.frames, 4, 4)
 assert np.isfinite(value) and np.abs(np.asarray(slope)[:, :3]).max() > 0
 np.testing.assert_allclose(rj.load_path("path.json").c2w, path.c2w, atol=1e-9)
 assert video.shape == (config.frames, config.height, config.width, 3)
+assert result.frames.shape == video.shape and result.evaluations == 3
+total, terms = jax.eval_shape(joint, params, {}, draw_batch(data, 0, 0, 1, drawn, scale_rule=config.scale_rule), jax.random.key(0))
+assert set(terms) == {"flow", "photometric", "x0"}
 assert x.shape == noise.shape and np.isfinite(np.asarray(x)).all()
 assert trees.flatten(trained).keys() == trees.flatten(params).keys()
 before, after = (trees.flatten(t)["renderer/rgb_head/linear/kernel"] for t in (params, trained))
@@ -33,7 +36,7 @@ trees.check(trained, model.specs(config))
 def test_the_page_runs(tmp_path):
     blocks = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
     code = "\n".join(blocks)
-    assert len(blocks) == 5 and code.count(LOAD) == 1
+    assert len(blocks) == 8 and code.count(LOAD) == 1
     code = code.replace(LOAD, TINY) + CHECKS
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False

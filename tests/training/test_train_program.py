@@ -68,7 +68,7 @@ def test_a_model_without_look_up_has_no_stage_for_it(tmp_path):
 @pytest.mark.parametrize(
     "words",
     [
-        ["--steps", "0"], ["--steps", "-1"], ["--batch", "0"], ["--lr", "nan"], ["--lr", "0"], ["--scale", "nan"],
+        ["--steps", "0"], ["--steps", "-1"], ["--batch", "0"], ["--lr", "nan"], ["--lr", "0"], ["--steps-scale", "nan"],
         ["--seed", "-1"], ["--devices", "-1"], ["--save-every", "0"], ["--log-every", "0"], ["--evaluate-every", "-1"],
         ["--context", "0"],
     ],

@@ -113,9 +113,9 @@ def test_scale_multiplies_the_steps_of_any_stage(name):
         args = train.parser().parse_args(["tiny", "--stage", name, *words])
         return [stage.steps for stage in train.choose(args, config.preset("tiny"))[1]]
 
-    assert steps("--scale", "0.5") == [n / 2 for n in steps()]
-    assert set(steps("--scale", "1e-6")) == {1}
-    assert set(steps("--scale", "0.5", "--steps", "7")) == {7}
+    assert steps("--steps-scale", "0.5") == [n / 2 for n in steps()]
+    assert set(steps("--steps-scale", "1e-6")) == {1}
+    assert set(steps("--steps-scale", "0.5", "--steps", "7")) == {7}
 
 
 def test_matching_features_are_trained_on_a_pool_with_depth(tmp_path):
