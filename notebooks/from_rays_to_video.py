@@ -34,9 +34,6 @@ import numpy as np
 
 import roge_jax as rj
 from roge_jax.core.params import count, flatten
-from roge_jax.scenes.scene import prepare
-from roge_jax.data.views import make_sample
-from roge_jax.geometry.cameras import concatenate
 from roge_jax.geometry.rays import plucker
 from roge_jax.video import flow, solvers
 
@@ -50,14 +47,9 @@ for part, tree in params.items():
 
 # %%
 scene, contexts = rj.load_scene("motorcycle"), [0, 1]
-photos, cameras = prepare(scene, contexts, config.height, config.width)
-path = rj.make_path("interpolate", cameras, config.frames)
-everything = concatenate(cameras, path)
-blank = np.zeros((len(path), config.height, config.width, 3), np.float32)
-views = make_sample(
-    np.concatenate([photos, blank]), everything.K, everything.c2w, len(contexts), scale_rule=config.scale_rule
-)
-del views["target_rgb"]
+photos = rj.sampling.read_photos(scene, contexts, config)
+path = rj.make_path("interpolate", photos.cameras, config.frames)
+views, info = rj.sampling.make_views(photos, path, config)
 print({name: array.shape for name, array in views.items()})
 
 # %% [markdown]
@@ -98,7 +90,7 @@ print("latents", latents.shape, "video", video.shape, "evaluations", int(info.ev
 shown = np.linspace(0, config.frames - 1, 5).astype(int)
 figure, axes = plt.subplots(3, 5, figsize=(10, 3.6))
 for column, frame in enumerate(shown):
-    top = photos[column] if column < len(photos) else np.ones_like(photos[0])
+    top = photos.images[column] if column < len(contexts) else np.ones_like(photos.images[0])
     for axis, image in zip(axes[:, column], (top, preview[len(contexts) + frame], video[frame])):
         axis.imshow(np.clip(image, 0, 1))
         axis.axis("off")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from parity import rel_l2
 
 from roge_jax import fusion, model
@@ -19,6 +20,7 @@ from roge_jax.data.views import make_sample
 from roge_jax.training import diagnose
 from roge_jax.video import dit, flow, vae
 
+at_once = compiled(model)
 # The gradient of the whole model takes long to compile. The VAE only encodes here and chunks of views only bound
 # memory; both have tests of their own.
 _TINY = preset("tiny")
@@ -110,10 +112,10 @@ def test_the_photometric_term_is_the_error_of_the_rgb_head_on_all_views():
     rng = np.random.default_rng(0)
     grid = (CONFIG.recon_height // 8, CONFIG.recon_width // 8)
     features = jnp.asarray(rng.standard_normal((M + N, *grid, CONFIG.renderer.width)), jnp.float32)
-    rgb = model.decode_rgb(whole(), features, views, config=CONFIG)
+    rgb = at_once.decode_rgb(whole(), features, views, config=CONFIG)
     truth = np.concatenate([views["context_rgb"], views["target_rgb"]])
     want = np.square(np.asarray(rgb, np.float64) - truth).mean()
-    got = model.photometric(rgb, views, config=CONFIG)
+    got = at_once.photometric(rgb, views, config=CONFIG)
     np.testing.assert_allclose(got, want, rtol=1e-5)
 
 
@@ -161,13 +163,15 @@ def test_what_the_paper_trains():
 def test_pictures_reach_the_vae_between_minus_one_and_one():
     """Photos one by one, videos as a whole, and back: black is -1, white is 1."""
     rgb = jnp.asarray(np.random.default_rng(2).random((5, 16, 24, 3)), jnp.float32)
-    p, cfg = whole(), CONFIG.vae
-    video = model.encode_targets(p, rgb, config=CONFIG)
-    np.testing.assert_allclose(video, vae.encode(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5)
-    photos = model.encode_contexts(p, rgb, config=CONFIG)
-    np.testing.assert_allclose(photos, vae.encode_frames(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5)
-    shown = model.decode_video(p, video, config=CONFIG)
-    raw = np.asarray(vae.decode(p["vae"], video, cfg=cfg))
+    p, cfg, codec = whole(), CONFIG.vae, compiled(vae)
+    video = at_once.encode_targets(p, rgb, config=CONFIG)
+    np.testing.assert_allclose(video, codec.encode(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5)
+    photos = at_once.encode_contexts(p, rgb, config=CONFIG)
+    np.testing.assert_allclose(
+        photos, codec.encode_frames(p["vae"], 2 * rgb - 1, cfg=cfg), atol=1e-5
+    )
+    shown = at_once.decode_video(p, video, config=CONFIG)
+    raw = np.asarray(codec.decode(p["vae"], video, cfg=cfg))
     np.testing.assert_allclose(shown, np.clip((raw + 1) / 2, 0, 1), atol=1e-5)
     # A first frame is coded as a photo of it.
     np.testing.assert_allclose(video[0], photos[0], atol=1e-5)
@@ -294,7 +298,7 @@ def test_intermediates_are_what_their_names_say():
     x0, noise, x, velocity = (np.asarray(a) for a in (found.x0, *found[-4:-1]))
     np.testing.assert_allclose(x, (1 - sigma) * x0 + sigma * noise, atol=1e-5)
     np.testing.assert_allclose(found.predicted_x0, x - sigma * velocity, atol=1e-5)
-    known = model.encode_contexts(whole(), views["context_rgb"], config=CONFIG)
+    known = at_once.encode_contexts(whole(), views["context_rgb"], config=CONFIG)
     np.testing.assert_allclose(x0[:M], known, atol=1e-5)
 
 
@@ -305,7 +309,7 @@ def test_the_terms_are_made_of_the_intermediates_and_another_one_is_added():
     weight = flow.loss_weight(found.sigma, weighting=cfg.weighting, shift=cfg.shift)
     want = (np.asarray(weight) * off[:, M:].mean((1, 2, 3, 4))).mean()
     np.testing.assert_allclose(terms["flow"], want, rtol=1e-5)
-    photometric = model.photometric(found.rgb, views, config=CONFIG)
+    photometric = at_once.photometric(found.rgb, views, config=CONFIG)
     np.testing.assert_allclose(terms["photometric"], photometric, rtol=1e-5)
     np.testing.assert_allclose(terms["x0"], distance(found, views)["x0"], rtol=1e-5)
     assert terms["x0"] > 0
@@ -370,7 +374,7 @@ def test_permuting_context_views_permutes_their_conditions(config):
 
     def run(order):
         turned = views | {k: views[k][order] for k in ("K", "c2w")}
-        return model.condition(whole(), known[order[:M]], features[order], turned, config=config)
+        return at_once.condition(whole(), known[order[:M]], features[order], turned, config=config)
 
     plain, turned = run(np.arange(M + N)), run(order)
     np.testing.assert_array_equal(turned.appearance, plain.appearance[slots])
@@ -408,14 +412,14 @@ def test_other_statistics_do_not_change_what_a_fusion_does():
     known, features, views = made_condition(CONFIG)
     width = CONFIG.renderer.width
     p, config = whole(), CONFIG
-    want = model.condition(p, known, features, views, config=config).tokens
+    want = at_once.condition(p, known, features, views, config=config).tokens
     for _ in range(2):  # from none, and from one to another
         new = measured(config, rng.normal(0, 3, width), rng.uniform(0.1, 9, width))
         p = p | {"fusion": fusion.restandardised(p["fusion"], config.fusion, new.fusion)}
         config = new
-        got = model.condition(p, known, features, views, config=config).tokens
+        got = at_once.condition(p, known, features, views, config=config).tokens
         assert rel_l2(got, want) < ROUNDING
-    assert rel_l2(model.condition(p, known, features, views, config=CONFIG).tokens, want) > 0.1
+    assert rel_l2(at_once.condition(p, known, features, views, config=CONFIG).tokens, want) > 0.1
 
 
 # Step 0.

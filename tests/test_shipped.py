@@ -62,6 +62,7 @@ def test_the_reconstruction_is_ahead_of_the_plane(close):
     assert above > (1.2 if close else 2.5) and sharpness > 0.5
 
 
+@pytest.mark.slow  # half a minute of compiling; test_sample.py and test_evaluate.py generate with a tiny model
 def test_the_generated_video_is_near_the_reconstructions_picture():
     """As the program samples: within a dB of it against the truth, and no greyer."""
     evaluator = evaluate.Evaluator("mini")

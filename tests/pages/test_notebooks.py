@@ -15,6 +15,27 @@ MOST_SECONDS = 180
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "notebooks").glob("*.py"))
 
 
+LOAD = 'params, config = rj.load("mini")\n'
+TINY = 'config = rj.preset("tiny")\nparams = rj.model.init(jax.random.key(0), config)\n'
+
+
+@pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
+def test_notebook_runs_on_a_tiny_model(source, tmp_path, monkeypatch, capsys):
+    """Every cell as it is, but for the model, whose programs compile in a fraction of the time."""
+    import matplotlib.pyplot as plt
+
+    code = source.read_text()
+    assert code.count(LOAD) == 1
+    monkeypatch.chdir(tmp_path)
+    found: dict = {}
+    exec(compile(code.replace(LOAD, TINY), str(source), "exec"), found)
+    plt.close("all")
+    config = found["config"]
+    assert config.name == "tiny" and "evaluations" in capsys.readouterr().out
+    assert found["video"].shape == (config.frames, config.height, config.width, 3)
+
+
+@pytest.mark.slow  # a minute on two cores, most of it compiling
 @pytest.mark.parametrize("source", NOTEBOOKS, ids=lambda p: p.stem)
 def test_notebook_runs(source, tmp_path):
     environment = os.environ | {"XLA_FLAGS": quick_xla.spelled()}

@@ -1,7 +1,7 @@
 """The commands and the Python of the README run as they are printed, with fewer steps and scenes.
 
-Among the fast tests `sample` runs with the shipped model; of `evaluate` and `train`, which compile longer, only the
-options are read: test_evaluate.py and test_train_program.py run them on a tiny model. The slow tests run all of them.
+Of `sample`, `evaluate` and `train`, which compile the shipped model, the fast tests read the options alone: test_sample.py,
+test_evaluate.py and test_train_program.py run them on a tiny model. The slow tests run all of them.
 """
 
 import os
@@ -15,7 +15,7 @@ import pytest
 import quick_xla
 from scene_files import nerfstudio, truth
 
-from roge_jax import evaluate, train
+from roge_jax import evaluate, sample, train
 from roge_jax.files import entry
 
 README = (Path(__file__).parents[2] / "README.md").read_text()
@@ -24,7 +24,7 @@ SHORTER = {  # later options win
     "roge_jax.evaluate": ["--steps", "2", "--scenes", "procedural:1000000000"],
     "roge_jax.train": ["--steps", "1", "--out", "runs/readme"],
 }
-LONG = {"roge_jax.evaluate": evaluate, "roge_jax.train": train}
+LONG = {"roge_jax.sample": sample, "roge_jax.evaluate": evaluate, "roge_jax.train": train}
 
 
 def blocks(language: str) -> list[str]:
