@@ -173,7 +173,7 @@ class RoGeConfig:
         if self.renderer.lookup == 1 or (self.renderer.lookup and p % 4):
             raise UserError(
                 f"renderer.lookup {self.renderer.lookup} with patches of {p} pixels does not fit: give 0 or at least 2 "
-                "cuts, and a patch that is a multiple of 4."
+                "depth hypotheses, and a patch that is a multiple of 4."
             )
         if self.output is not None and (
             len(self.output) != 2

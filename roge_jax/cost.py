@@ -406,13 +406,13 @@ def report(
         f"model     {config.name}: {sum(weight_bytes(config).values()) / 4e6:,.1f} M parameters, "
         f"{sum(first.weights.values()) / 1e9:,.2f} GB in {'bfloat16' if half else 'float32'}",
         f"video     {frames} frames of {config.height}x{config.width}{pictures} (reconstruction at "
-        f"{config.recon_height}x{config.recon_width}), windows of {config.frames}: {runs}",
+        f"{config.recon_height}x{config.recon_width}), chunks of {config.frames}: {runs}",
         f"photos    {m}" + (f", then {later} with frames already made" if later != m else ""),
         "tokens    " + ", ".join(f"{n:,} {name}" for name, n in first.tokens.items()),
         f"latents   {' x '.join(map(str, latents))}",
         f"solver    {solver}",
         "",
-        f"{'stage (first window)':24s}{'FLOPs':>16s}{'working memory':>18s}",
+        f"{'stage (first chunk)':24s}{'FLOPs':>16s}{'working memory':>18s}",
     ]
     for name, flops in first.flops.items():
         times = f", each of {evaluations}" if name == "velocity" else ""
@@ -421,7 +421,7 @@ def report(
     return "\n".join(
         [
             *lines,
-            f"{'all windows':24s}{scaled(total, 'FLOP'):>16s}",
+            f"{'all chunks':24s}{scaled(total, 'FLOP'):>16s}",
             "",
             f"peak memory about {scaled(peak, 'B')}: weights and the hungriest stage, beside the "
             "runtime's own 0.3 to 0.6 GB",

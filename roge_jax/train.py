@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument(
         "--data",
         type=Path,
-        help="pool written by roge_jax.procedural (default: render as we go)",
+        help="dataset, a folder written by roge_jax.procedural or data.pack (default: render as we go)",
     )
     p.add_argument(
         "--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)"
@@ -241,7 +241,7 @@ def choose(args: argparse.Namespace, cfg):
     if not cfg.renderer.lookup:
         if args.stage == "lookup":
             raise UserError(
-                f"--stage lookup trains the photo look-up, and this model of '{cfg.name}' has none (renderer.lookup is "
+                f"--stage lookup trains image-based rendering, and this model of '{cfg.name}' has none (renderer.lookup is "
                 "0): start from one that has, such as --init mini, or from scratch."
             )
         recipe = [stage for stage in recipe if not stage.lookup]

@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     option("--convention", f"axes of the poses, {same}", type=one_of(CONVENTIONS))
     option("--trajectory", f"the path to begin with, {same}", metavar="NAME|FILE")
     option("--path-frame", f"coordinates of a path file, {same}", metavar="WHERE")
-    option("--frames", "length of ready-made paths; the model's window", type=number(1))
+    option("--frames", "length of ready-made paths; the model's chunk", type=number(1))
     option(
         "--fps",
         "frames per second; the path file's own, else 16",

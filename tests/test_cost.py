@@ -275,11 +275,11 @@ class TestEstimate:
         text = cost.report(config, 2, 8, frames=3 * config.frames, later=4, half=False, solver="x")
         total = cost.scaled(first.total_flops + 2 * other.total_flops, "FLOP")
         peak = cost.scaled(max(first.peak_bytes, other.peak_bytes), "B")
-        assert f"windows of {config.frames}: 3" in text
-        assert f"\n{'all windows':24s}{total:>16s}\n" in text and f"about {peak}: weights" in text
+        assert f"chunks of {config.frames}: 3" in text
+        assert f"\n{'all chunks':24s}{total:>16s}\n" in text and f"about {peak}: weights" in text
         alone = cost.report(config, 2, 8, frames=config.frames, later=4, half=False, solver="x")
         total = cost.scaled(first.total_flops, "FLOP")
-        assert f"\n{'all windows':24s}{total:>16s}\n" in alone and "photos    2\n" in alone
+        assert f"\n{'all chunks':24s}{total:>16s}\n" in alone and "photos    2\n" in alone
 
     def test_a_preview_costs_one_more_encoding_and_decoding(self):
         plain = preset("tiny")

@@ -114,6 +114,15 @@ def test_no_two_units_need_each_other():
     assert not left, f"in a circle: {sorted(left)}"
 
 
+def test_former_names_of_functions_are_found_with_a_warning():
+    from roge_jax.data import dataset
+
+    with pytest.warns(DeprecationWarning, match="read_pool is read_dataset now"):
+        assert dataset.read_pool is dataset.read_dataset
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = dataset.nothing
+
+
 def test_former_names_are_found_with_a_warning():
     """Modules that have moved are the same modules, as imports, attributes and programs."""
     from roge_jax.core.lazy import MOVED

@@ -38,7 +38,7 @@ from experiments.ablation import adaptation, generator, reconstruction, report, 
 from roge_jax import checkpoint, model
 from roge_jax.config import preset
 from roge_jax.core.params import Tree, flatten
-from roge_jax.data.pool import read_pool
+from roge_jax.data.dataset import read_dataset
 from roge_jax.data.source import ProceduralSource
 from roge_jax.files import entry
 
@@ -61,7 +61,7 @@ class Job(NamedTuple):
 
 def jobs(args: argparse.Namespace) -> dict[str, Job]:
     """Everything to measure, in the order of the run."""
-    source = read_pool(args.data) if args.data else ProceduralSource(64, 112, 24)
+    source = read_dataset(args.data) if args.data else ProceduralSource(64, 112, 24)
     mini, (params, config) = preset("mini"), checkpoint.load_model("mini")
     plain = dataclasses.replace(mini, renderer=dataclasses.replace(mini.renderer, lookup=0))
     weights = {"weights": checkpoint.weights_fingerprint(params, "float32"), "clips": args.clips}

@@ -22,6 +22,7 @@ MOVED = {
     "data.matching": "scenes.matching",
     "data.overlap": "scenes.overlap",
     "data.perturb": "data.faults",
+    "data.pool": "data.dataset",
     "data.procedural": "procedural.scenes",
     "data.raycast": "procedural.raycast",
     "data.readers": "scenes.readers",
@@ -62,6 +63,22 @@ def submodules(
         return [module.name for module in pkgutil.iter_modules(sys.modules[package].__path__)]
 
     return load, lambda: sorted([*modules(), *home])
+
+
+def renamed(module: str, **names: str) -> Callable[[str], Any]:
+    """`__getattr__` of a module that still finds names by what they were called before, with a DeprecationWarning.
+
+    __getattr__ = renamed(__name__, read_pool="read_dataset")
+    """
+
+    def find(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+        said = f"{module}.{name} is {names[name]} now."
+        warnings.warn(said, DeprecationWarning, stacklevel=2)
+        return getattr(sys.modules[module], names[name])
+
+    return find
 
 
 class Moved(importlib.abc.MetaPathFinder, importlib.abc.InspectLoader):

@@ -1,4 +1,4 @@
-"""Training data: pools of sequences, sources, samples of views, faults that photos have."""
+"""Training data: datasets of sequences, their readers, samples of views, faults that photos have."""
 
 from ..core.lazy import submodules
 

@@ -1,4 +1,4 @@
-"""Your own posed sequences as training data: scene folders into the pool that `train --data` reads.
+"""Your own posed sequences as training data: scene folders into the dataset that `train --data` reads.
 
     python -m roge_jax.data.pack SCENE .. --out runs/mine --frames 24 --height 64 --width 112
 
@@ -60,7 +60,7 @@ def pack_scene(scene: Scene, stem: Path, *, frames: int, height: int, width: int
     if len(scene) < frames:
         raise UserError(
             f"{scene.source}: has {len(scene)} views, a sequence needs {frames}: add views, or give --frames "
-            f"{len(scene)} (at least the model's window, which is 17 for mini)."
+            f"{len(scene)} (at least the model's chunk, which is 17 for mini)."
         )
     starts, order = runs(len(scene), frames), walk_order(scene)
     if order != list(range(len(scene))):
@@ -91,9 +91,9 @@ def pack(
     width: int = 112,
     convention: str | None = None,
 ) -> int:
-    """Write scenes (as `load_scene` takes them) into the new pool `out`; the number of sequences.
+    """Write scenes (as `load_scene` takes them) into the new dataset `out`; the number of sequences.
 
-    `pool.read_pool` reads it: sequences of `frames` views, `rgb` uint8 [f, height, width, 3], `K` and `c2w` float64.
+    `dataset.read_dataset` reads it: sequences of `frames` views, `rgb` uint8 [f, height, width, 3], `K` and `c2w` float64.
     `convention`: axes of the poses of a transforms.json that are not OpenGL.
     Raises: UserError naming the scene and what it lacks, or if `out` holds something already.
     """

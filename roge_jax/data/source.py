@@ -1,9 +1,9 @@
-"""Where training sequences come from: a pool on disk, or procedural scenes rendered when they are asked for."""
+"""Where training sequences come from: a dataset on disk, or procedural scenes rendered when they are asked for."""
 
 from pathlib import Path
 
 from ..errors import UserError
-from .pool import read_pool
+from .dataset import read_dataset
 
 
 class ProceduralSource:
@@ -29,30 +29,30 @@ class ProceduralSource:
 
 
 def open_source(folder: Path | None, height: int, width: int, window: int, depth: bool = False):
-    """Sequences to draw training samples of `window` targets at height x width from: the pool in `folder`, or
+    """Sequences to draw training samples of `window` targets at height x width from: the dataset in `folder`, or
     procedural ones.
 
     With `depth`, sequences have it.
 
     Raises:
-        UserError: the pool has no depth, or its frames are not that size or a whole multiple of it, or are fewer than the window.
+        UserError: the dataset has no depth, or its frames are not that size or a whole multiple of it, or are fewer than the window.
     """
     if folder is None:
         return ProceduralSource(height, width, frames=max(24, window + 3), depth=depth)
-    pool = read_pool(folder)
-    if depth and not pool.depth:
+    found = read_dataset(folder)
+    if depth and not found.depth:
         raise UserError(
-            f"{folder}: its scenes have no depth, which this stage learns from: render the pool with --depth."
+            f"{folder}: its scenes have no depth, which this stage learns from: render the dataset with --depth."
         )
-    frames, h, w = pool[0]["rgb"].shape[:3]
+    frames, h, w = found[0]["rgb"].shape[:3]
     if h % height or w % width or h // height != w // width:
         raise UserError(
-            f"{folder}: its frames are {h}x{w} and this stage trains at {height}x{width}: give a pool of that size or "
+            f"{folder}: its frames are {h}x{w} and this stage trains at {height}x{width}: give a dataset of that size or "
             f"of a whole multiple of it, or another --size."
         )
     if frames < window:
         raise UserError(
-            f"{folder}: its sequences have {frames} frames and this stage trains on windows of {window}: render or "
+            f"{folder}: its sequences have {frames} frames and this stage trains on chunks of {window}: render or "
             f"pack longer ones with --frames."
         )
-    return pool
+    return found

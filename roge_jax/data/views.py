@@ -87,7 +87,7 @@ def _depth_of(sequence: dict, views: np.ndarray, size: tuple[int, int] | None, n
     """Depth of views [v, h, w] at `size`, each pixel that of the middle of its block."""
     if "depth" not in sequence:
         raise UserError(
-            f"Sequence {number} of the data has no depth, which this stage learns from: render the pool with --depth."
+            f"Sequence {number} of the data has no depth, which this stage learns from: render the dataset with --depth."
         )
     depth = np.asarray(sequence["depth"][views], np.float32)
     if size is not None:
@@ -105,7 +105,7 @@ def average_down(rgb: np.ndarray, K: np.ndarray, size: tuple[int, int] | None):
     fy, fx = h // size[0], w // size[1]
     if (fy * size[0], fx * size[1]) != (h, w):
         raise UserError(
-            f"Frames of {h}x{w} cannot be averaged to {size[0]}x{size[1]}: render the pool at a multiple of it."
+            f"Frames of {h}x{w} cannot be averaged to {size[0]}x{size[1]}: render the dataset at a multiple of it."
         )
     K = K * np.array([1 / fx, 1 / fy, 1.0])[None, :, None]
     return x.reshape(v, size[0], fy, size[1], fx, c).mean((2, 4)), K

@@ -1,6 +1,6 @@
 """Rendered scenes from the command line.
 
-python -m roge_jax.procedural pool --out DIR --scenes 2000 --processes 4
+python -m roge_jax.procedural dataset --out DIR --scenes 2000 --processes 4
 python -m roge_jax.procedural sheet --out docs/media/procedural.png
 python -m roge_jax.procedural bench
 """
@@ -8,14 +8,16 @@ python -m roge_jax.procedural bench
 import argparse
 import json
 import os
+import sys
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..data.pool import write_pool
+from ..data.dataset import write_dataset
 from ..files.entry import execute, number
 from ..files.folders import output_file
 
@@ -70,26 +72,32 @@ def _bench(height: int, width: int, frames: int, supersample: int) -> dict:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """`python -m roge_jax.procedural {pool,sheet,bench}`."""
+    """`python -m roge_jax.procedural {dataset,sheet,bench}`."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    if words[:1] == ["pool"]:
+        warnings.warn("`procedural pool` is `procedural dataset` now.", FutureWarning, stacklevel=2)
+        words[0] = "dataset"
     parser = argparse.ArgumentParser(prog="python -m roge_jax.procedural")
     commands = parser.add_subparsers(dest="command", required=True)
     seeds = "seed of the first scene; from 1000000000 on they are held out"
-    pool = commands.add_parser("pool", help="render many sequences into a folder")
-    pool.add_argument("--out", type=Path, required=True, help="folder to write")
-    pool.add_argument("--scenes", type=number(1, 10**7), default=2000, help="how many")
-    pool.add_argument("--first-seed", type=number(), default=0, help=seeds)
+    dataset = commands.add_parser("dataset", help="render many sequences into a folder")
+    dataset.add_argument("--out", type=Path, required=True, help="folder to write")
+    dataset.add_argument("--scenes", type=number(1, 10**7), default=2000, help="how many")
+    dataset.add_argument("--first-seed", type=number(), default=0, help=seeds)
     cores = os.cpu_count() or 1
     at_once = "how many render at a time (default: all cores)"
-    pool.add_argument("--processes", type=number(1), default=cores, help=at_once)
-    pool.add_argument("--scenes-per-shard", type=number(1), default=100, help="scenes in one file")
-    pool.add_argument(
+    dataset.add_argument("--processes", type=number(1), default=cores, help=at_once)
+    dataset.add_argument(
+        "--scenes-per-shard", type=number(1), default=100, help="scenes in one file"
+    )
+    dataset.add_argument(
         "--textures",
         type=Path,
         help="a folder of pictures to cut textures from, beside the built-in ones; a tenth of their kinds (names up to the "
         "last _) is held out",
     )
-    pool.add_argument("--depth", action="store_true", help="also write float16 z-depth")
-    pool.add_argument(
+    dataset.add_argument("--depth", action="store_true", help="also write float16 z-depth")
+    dataset.add_argument(
         "--varied",
         action=argparse.BooleanOptionalAction,
         help="many orbits and lenses (default: for training seeds, not for held-out ones)",
@@ -99,29 +107,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sheet.add_argument("--scenes", type=number(1, 10**7), default=8, help="how many")
     sheet.add_argument("--first-seed", type=number(), default=0, help=seeds)
     sheet.add_argument("--varied", action="store_true", help="as in training: many orbits, lenses")
-    for command in (pool, sheet):
+    for command in (dataset, sheet):
         command.add_argument(
             "--handheld", action="store_true", help="photos from all around, from above, and rolled"
         )
     bench = commands.add_parser("bench", help="measure frames per second; prints JSON")
-    for command, frames in ((pool, 24), (sheet, 4), (bench, 24)):
+    for command, frames in ((dataset, 24), (sheet, 4), (bench, 24)):
         command.add_argument("--frames", type=number(1), default=frames, help="views of a scene")
         command.add_argument("--height", type=number(1), default=64, help="of the views")
         command.add_argument("--width", type=number(1), default=112, help="of the views")
-    for command in (pool, bench):
+    for command in (dataset, bench):
         rays = "rays per pixel and side"
         command.add_argument("--supersample", type=number(1), default=2, help=rays)
-    for command in (pool, sheet, bench):
+    for command in (dataset, sheet, bench):
         command.add_argument("--debug", action="store_true", help="show tracebacks")
-    return execute(_run, parser, arguments)
+    return execute(_run, parser, words)
 
 
 def _run(args: argparse.Namespace) -> None:
     from .scenes import HELDOUT_SEED
 
-    if args.command == "pool":
+    if args.command == "dataset":
         training = args.first_seed < HELDOUT_SEED
-        write_pool(
+        write_dataset(
             args.out,
             range(args.first_seed, args.first_seed + args.scenes),
             args.frames,

@@ -4,7 +4,7 @@ A scene is a room, a walled yard or open ground with 12 primitives, photographic
 and one point light; `raycast.render` draws it with exact depth. Seeds below `HELDOUT_SEED` are for
 training, the others for evaluation with textures never used in training.
 
-    python -m roge_jax.procedural pool --out DIR --scenes 2000 --processes 4
+    python -m roge_jax.procedural dataset --out DIR --scenes 2000 --processes 4
 """
 
 import dataclasses

@@ -51,14 +51,14 @@ def spans(plan: Planned | None, windows: list[Span], length: int) -> tuple[list[
     generate, length = plan.choices.generate, plan.choices.frames
     if len(generate) != len(windows):
         raise UserError(
-            f"The plan is for {len(generate)} windows and this path has {len(windows)}: plan again for this path."
+            f"The plan is for {len(generate)} chunks and this path has {len(windows)}: plan again for this path."
         )
     found = [span or (start, start) for span, (start, _) in zip(generate, windows)]
     for (first, last), (start, stop) in zip(found, windows, strict=True):
         whole = min(stop, first + length)  # as far as a stretch goes that begins there
         if not start <= first <= last or last not in (first, whole) or (first - start) % GROUP:
             raise UserError(
-                f"The plan generates frames {first} to {last - 1}, {length} at a time, in a window of the frames "
+                f"The plan generates frames {first} to {last - 1}, {length} at a time, in a chunk of the frames "
                 f"{start} to {stop - 1}: plan again for this path."
             )
     return found, length

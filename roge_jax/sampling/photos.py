@@ -67,7 +67,7 @@ def context_ids(
 
 
 def _chosen(scene: Scene, count: int, config: RoGeConfig, path: Cameras | None) -> list[int]:
-    """So many photos of a scene: those that see most of the path, or that hang together; all where there are no more."""
+    """So many photos of a scene: those that see most of the path, or that overlap; all where there are no more."""
     if path is not None and count < len(scene):
         return see_path(scene, path, count, config.height, config.width)
     if count in (1, len(scene)):

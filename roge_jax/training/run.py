@@ -26,7 +26,7 @@ class Options:
     """What all stages of a run have in common; the names are those of the command line (docs/reference/programs.md)."""
 
     out: Path
-    data: Path | None = None  # a pool, or rendered as we go
+    data: Path | None = None  # a dataset, or rendered as we go
     seed: int = 0
     resume: bool = False
     skip_done: bool = False  # with `resume`: a stage whose model is there is not run again

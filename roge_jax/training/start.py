@@ -25,7 +25,7 @@ PUT_BACK = "put it back and continue with --resume, nothing that was trained is 
 
 
 def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
-    """The sequences of a stage. Raises: UserError if the pool does not have its size or frames."""
+    """The sequences of a stage. Raises: UserError if the dataset does not have its size or frames."""
     working = stage_config(config, stage)
     window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
     try:
@@ -139,7 +139,7 @@ def check_processes(
 
 
 def pool_fingerprint(pool: Path) -> str:
-    """`folders.fingerprint_files` of a pool."""
+    """`folders.fingerprint_files` of a dataset."""
     return fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
 
 

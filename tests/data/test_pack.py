@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scene_files import HEIGHT, WIDTH, nerfstudio, truth
 
+from roge_jax.data.dataset import read_dataset
 from roge_jax.data.pack import main, pack, runs
-from roge_jax.data.pool import read_pool
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.scenes.scene import load_scene, prepare
@@ -27,7 +27,7 @@ def test_pool_holds_the_views_of_the_scene(scene, tmp_path):
     other = nerfstudio(tmp_path / "other", truth(4))
     height, width = HEIGHT // 2, WIDTH // 2
     assert pack([scene, other], tmp_path / "pool", frames=4, height=height, width=width) == 3
-    pool = read_pool(tmp_path / "pool")
+    pool = read_dataset(tmp_path / "pool")
     assert len(pool) == 3
     images, cameras = prepare(load_scene(scene), range(1, 5), height, width)
     np.testing.assert_allclose(pool[1]["rgb"] / 255.0, images, atol=0.5 / 255 + 1e-6)
@@ -70,7 +70,7 @@ def test_runs_follow_the_walk(tmp_path, capsys, shuffled):
     content["frames"] = [content["frames"][i] for i in order]
     file.write_text(json.dumps(content))
     assert pack([folder], tmp_path / "pool", frames=12, height=12, width=20) == 1
-    pool = read_pool(tmp_path / "pool")
+    pool = read_dataset(tmp_path / "pool")
     np.testing.assert_allclose(pool[0]["c2w"], truth(12).c2w, atol=1e-9)
     walk = load_scene(nerfstudio(tmp_path / "walk", truth(12)))
     images, cameras = prepare(walk, range(12), 12, 20)

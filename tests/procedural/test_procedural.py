@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from roge_jax.data.pool import _missing, read_pool, write_pool
+from roge_jax.data.dataset import _missing, read_dataset, write_dataset
 from roge_jax.errors import UserError
 from roge_jax.procedural import __main__ as program
 from roge_jax.procedural import raycast
@@ -369,18 +369,18 @@ def test_bad_requests_name_what_is_allowed(tmp_path):
     with pytest.raises(UserError, match="heldout"):
         load_textures("held-out")
     with pytest.raises(UserError, match="at least one"):
-        write_pool(tmp_path, [], 2, 8, 12)
+        write_dataset(tmp_path, [], 2, 8, 12)
     with pytest.raises(UserError, match="mix"):
-        write_pool(tmp_path, [1, HELDOUT_SEED], 2, 8, 12)
+        write_dataset(tmp_path, [1, HELDOUT_SEED], 2, 8, 12)
     with pytest.raises(UserError, match=r"no finished shard"):
-        read_pool(tmp_path)
+        read_dataset(tmp_path)
 
 
 def test_pool_round_trip_resume_and_guards(tmp_path):
     size = {name: SMALL[name] for name in ("frames", "height", "width")}  # compiled already
     options = {"supersample": 1, "scenes_per_shard": 2, "depth": True}
-    write_pool(tmp_path, range(3), **size, processes=1, **options)
-    pool = read_pool(tmp_path)
+    write_dataset(tmp_path, range(3), **size, processes=1, **options)
+    pool = read_dataset(tmp_path)
     assert len(pool) == 3 and list(pool.seeds) == [0, 1, 2]
     assert not list(tmp_path.glob("*.part"))
     for index in range(3):
@@ -397,18 +397,18 @@ def test_pool_round_trip_resume_and_guards(tmp_path):
         pool[3]
 
     stamps = {p: p.stat().st_mtime_ns for p in tmp_path.glob("shard*")}
-    write_pool(tmp_path, range(3), **size, **options)  # nothing is missing: nothing is rendered
+    write_dataset(tmp_path, range(3), **size, **options)  # nothing is missing: nothing is rendered
     assert stamps == {p: p.stat().st_mtime_ns for p in tmp_path.glob("shard*")}
     with pytest.raises(UserError, match="frames 5"):
-        write_pool(tmp_path, range(3), **size | {"frames": 4}, **options)
+        write_dataset(tmp_path, range(3), **size | {"frames": 4}, **options)
     (tmp_path / "shard_00000.npz").unlink()  # as if the writer had died before the last rename
     missing = _missing(tmp_path, np.arange(3), {"scenes_per_shard": 2})
     assert [stem.name for stem, _, _ in missing] == ["shard_00000"]
-    assert list(read_pool(tmp_path).seeds) == [2]
+    assert list(read_dataset(tmp_path).seeds) == [2]
 
 
 def _hold(path, ready, release):
-    from roge_jax.data.pool import _sole_writer
+    from roge_jax.data.dataset import _sole_writer
 
     with _sole_writer(path):
         ready.set()
@@ -423,7 +423,7 @@ def test_two_writers_cannot_share_a_pool(tmp_path):
     try:
         assert ready.wait(60)
         with pytest.raises(UserError, match="another process"):
-            write_pool(tmp_path, [0], 2, 8, 12)
+            write_dataset(tmp_path, [0], 2, 8, 12)
         assert not list(tmp_path.glob("shard*"))
     finally:
         release.set()
@@ -431,7 +431,7 @@ def test_two_writers_cannot_share_a_pool(tmp_path):
 
 
 def test_command_line_reports_mistakes_in_one_sentence(tmp_path):
-    command = [sys.executable, "-m", "roge_jax.procedural", "pool", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "roge_jax.procedural", "dataset", "--out", str(tmp_path)]
     done = subprocess.run([*command, "--first-seed", "-3"], capture_output=True, text=True)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert "seed -3" in done.stderr and len(done.stderr.strip().splitlines()) == 1
@@ -439,8 +439,8 @@ def test_command_line_reports_mistakes_in_one_sentence(tmp_path):
 
 def test_training_pools_are_varied_and_held_out_ones_are_not(monkeypatch, tmp_path):
     asked = []
-    monkeypatch.setattr(program, "write_pool", lambda *a, **options: asked.append(options))
-    command = ["pool", "--out", str(tmp_path), "--scenes", "1", "--first-seed"]
+    monkeypatch.setattr(program, "write_dataset", lambda *a, **options: asked.append(options))
+    command = ["dataset", "--out", str(tmp_path), "--scenes", "1", "--first-seed"]
     program.main([*command, "0"])
     program.main([*command, "0", "--no-varied"])
     program.main([*command, str(HELDOUT_SEED)])
@@ -449,16 +449,22 @@ def test_training_pools_are_varied_and_held_out_ones_are_not(monkeypatch, tmp_pa
     assert [options["handheld"] for options in asked] == [False, False, False, True]
 
 
+def test_the_former_name_of_the_command_still_works(tmp_path, capsys):
+    with pytest.warns(FutureWarning, match="`procedural dataset` now"):
+        assert program.main(["pool", "--out", str(tmp_path), "--scenes", "0"]) == 2
+    assert "'0' is not a whole number" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["pool"], "required: --out"),
+        (["dataset"], "required: --out"),
         (["pol"], "invalid choice"),
-        (["pool", "--out", "{}/p", "--scenes", "0"], "'0' is not a whole number of at least 1"),
-        (["pool", "--out", "{}/p", "--height", "wide"], "'wide' is not a whole number"),
-        (["pool", "--out", "{}/p", "--hight", "8"], "did you mean '--height'"),
-        (["pool", "--out", "{}/torn"], "pool.json: not valid JSON"),
-        (["pool", "--out", "{}/file"], "File exists"),
+        (["dataset", "--out", "{}/p", "--scenes", "0"], "'0' is not a whole number of at least 1"),
+        (["dataset", "--out", "{}/p", "--height", "wide"], "'wide' is not a whole number"),
+        (["dataset", "--out", "{}/p", "--hight", "8"], "did you mean '--height'"),
+        (["dataset", "--out", "{}/torn"], "pool.json: not valid JSON"),
+        (["dataset", "--out", "{}/file"], "File exists"),
         (["sheet", "--out", "{}/x.txt"], "ends in .png"),
         (["bench", "--frames", "-1"], "'-1' is not a whole number"),
     ],
@@ -482,7 +488,7 @@ def _shard(folder):
 @pytest.mark.parametrize("damage", ["no pictures", "cut", "junk", "floats", "cut cameras", "no K"])
 def test_damaged_shards_are_named(damage, tmp_path):
     rgb, cameras = _shard(tmp_path)
-    assert len(read_pool(tmp_path)) == 2
+    assert len(read_dataset(tmp_path)) == 2
     changes = {
         "no pictures": rgb.unlink,
         "cut": lambda: rgb.write_bytes(rgb.read_bytes()[:500]),
@@ -492,8 +498,8 @@ def test_damaged_shards_are_named(damage, tmp_path):
         "no K": lambda: np.savez(cameras, seeds=np.arange(2)),
     }
     changes[damage]()
-    with pytest.raises(UserError, match=r"shard_00000: .*write the pool again"):
-        read_pool(tmp_path)
+    with pytest.raises(UserError, match=r"shard_00000: .*write the dataset again"):
+        read_dataset(tmp_path)
 
 
 def pictures(folder, kinds: int):
@@ -533,9 +539,11 @@ def test_a_pool_with_textures_of_a_folder_differs_and_says_so(tmp_path):
     folder = pictures(tmp_path / "pictures", 12)
     size = {"frames": 2, "height": 16, "width": 24, "supersample": 1}
     plain = sample_sequence(7, **size, varied=True)
-    write_pool(tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=folder)
-    made = read_pool(tmp_path / "pool")[0]
+    write_dataset(tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=folder)
+    made = read_dataset(tmp_path / "pool")[0]
     np.testing.assert_allclose(made["c2w"], plain["c2w"])
     assert not np.array_equal(made["rgb"], plain["rgb"])
-    with pytest.raises(UserError, match="holds a pool with textures"):
-        write_pool(tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=tmp_path)
+    with pytest.raises(UserError, match="holds a dataset with textures"):
+        write_dataset(
+            tmp_path / "pool", [7], 2, 16, 24, supersample=1, varied=True, textures=tmp_path
+        )

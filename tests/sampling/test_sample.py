@@ -610,7 +610,7 @@ def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
 def test_dry_run_counts_windows(place, capsys):
     assert program(place, "--dry-run", "--frames", 12, "--context", 3, out="dry") == 0
     shown = capsys.readouterr().out
-    assert "windows of 5: 3" in shown and "3, then 5 with frames already made" in shown
+    assert "chunks of 5: 3" in shown and "3, then 5 with frames already made" in shown
     assert not (place / "dry").exists()
 
 

@@ -60,7 +60,7 @@ def make_cheap(monkeypatch) -> None:
     monkeypatch.setattr(stages, "measure_features", lambda params, source, cfg, seed: (params, cfg))
 
 
-def write_pool(folder, size, seed=0, frames=12):
+def write_dataset(folder, size, seed=0, frames=12):
     """Two sequences of noise [frames, height, width] that move sideways."""
     rng, (height, width) = np.random.default_rng(seed), size
     folder.mkdir(parents=True)

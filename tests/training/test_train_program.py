@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from train_runs import losses, run, write_pool
+from train_runs import losses, run, write_dataset
 
 from roge_jax import config, model, train
 from roge_jax.checkpoint import load_model, model_fingerprint, save_model
@@ -289,7 +289,7 @@ def test_a_pool_must_have_the_frames_that_the_stage_trains_on(tmp_path):
     for size in ((32, 48), (64, 128), (16, 64)):
         with pytest.raises(UserError, match=f"32x64 and this stage trains at {size[0]}x{size[1]}"):
             open_source(tmp_path, *size, 6)
-    with pytest.raises(UserError, match=r"6 frames .* windows of 7"):
+    with pytest.raises(UserError, match=r"6 frames .* chunks of 7"):
         open_source(tmp_path, 32, 64, 7)
 
 
@@ -321,7 +321,7 @@ def test_another_start_or_pool_of_the_same_name_is_refused(common, cheap, tmp_pa
     cfg = config.preset("tiny")
     for name, seed in (("a", 0), ("b", 1)):
         save_model(tmp_path / name / "model", model.init(jax.random.key(seed), cfg), cfg)
-        write_pool(tmp_path / name / "pool", (32, 48), seed)
+        write_dataset(tmp_path / name / "pool", (32, 48), seed)
 
     def go(start, pool, *more):
         given = ["--init", tmp_path / start / "model", "--data", tmp_path / pool / "pool"]
@@ -353,7 +353,7 @@ def test_another_start_or_pool_of_the_same_name_is_refused(common, cheap, tmp_pa
 def test_every_setting_that_changes_what_is_trained_is_held(tmp_path):
     cfg = config.preset("tiny")
     stage = stages.lora_stage(10, frames=cfg.frames)
-    pool = write_pool(tmp_path / "pool", (32, 48))
+    pool = write_dataset(tmp_path / "pool", (32, 48))
 
     def hold(begun=True, stage=stage, config=cfg, params=0.0, **changes):
         given = {"seed": 0, "frozen_dtype": "float32", "start": "a", "pool": pool} | changes
@@ -430,7 +430,7 @@ def test_what_is_looked_at_reaches_log_events_and_terminal(common, tmp_path, mon
 
     monkeypatch.setattr(model, "loss", loss)
     monkeypatch.setattr(diagnose, "flow_by_sigma", lambda p, b, k, sigmas, **_: jnp.asarray(sigmas))
-    pool = write_pool(tmp_path / "pool", (32, 48))
+    pool = write_dataset(tmp_path / "pool", (32, 48))
     given = ["--data", pool, "--out", tmp_path, "--steps", 3, "--frozen-dtype", "bfloat16"]
     run(*common, *given, "--diagnose-every", 2, "--tensorboard", "--show-mesh")
     rows = [json.loads(line) for line in (tmp_path / "lora/log.jsonl").read_text().splitlines()]

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from train_runs import run, same, write_pool
+from train_runs import run, same, write_dataset
 
 from roge_jax import config, model, train
 from roge_jax.checkpoint import load_model, save_model
 from roge_jax.core.params import flatten
-from roge_jax.data.pool import write_pool as procedural_pool
+from roge_jax.data.dataset import write_dataset as procedural_dataset
 from roge_jax.errors import UserError
 from roge_jax.training import stages
 
@@ -25,7 +25,7 @@ def test_all_stages_run_and_go_on_after_an_interruption(
 ):
     if not real:
         request.getfixturevalue("cheap")
-    pool = write_pool(tmp_path / "pool", (64, 96))
+    pool = write_dataset(tmp_path / "pool", (64, 96))
     options = [*common, "--stage", "all", "--data", pool, "--steps", 2, "--batch", 1]
     run(*options, "--out", tmp_path / "whole")
     cfg = config.preset("tiny")
@@ -83,7 +83,7 @@ def test_crops_fit_into_the_pictures():
 
 
 def test_all_refuses_a_pool_that_its_last_stage_cannot_use_before_the_first(common, tmp_path):
-    pool = write_pool(tmp_path / "pool", (32, 48))
+    pool = write_dataset(tmp_path / "pool", (32, 48))
     with pytest.raises(UserError, match=r"Stage hires: .* 32x48 and this stage trains at 64x96"):
         run(*common, "--stage", "all", "--data", pool, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -93,7 +93,7 @@ def test_hires_leaves_the_reconstruction_bit_for_bit(common, cheap, tmp_path):
     cfg = config.preset("tiny")
     start = model.init(jax.random.key(0), cfg)
     save_model(tmp_path / "start", start, cfg, dtype=jnp.float32)
-    pool = write_pool(tmp_path / "pool", (64, 96))
+    pool = write_dataset(tmp_path / "pool", (64, 96))
     given = ["--init", tmp_path / "start", "--data", pool, "--steps", 1]
     found = {}
     for stage, size in (("lora", []), ("hires", [])):
@@ -128,7 +128,7 @@ def test_matching_features_are_trained_on_a_pool_with_depth(tmp_path):
     size = (stages.FINER * cfg.height, stages.FINER * cfg.width)
     seeds, options = range(2), {"supersample": 1, "varied": True}
     for name, depth in (("bare", False), ("pool", True)):
-        procedural_pool(tmp_path / name, seeds, 6, *size, depth=depth, **options)
+        procedural_dataset(tmp_path / name, seeds, 6, *size, depth=depth, **options)
     words = [
         "tiny",
         "--init",

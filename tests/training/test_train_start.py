@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import jax
 import published_files as made
 import pytest
-from train_runs import run, write_pool
+from train_runs import run, write_dataset
 
 from roge_jax import checkpoint, config, convert, export, model, train
 from roge_jax.checkpoint import load_provenance
@@ -43,7 +43,7 @@ def converted(folder, *options, recon="lagernvs"):
 
 def test_licences_of_published_weights_reach_every_adapter_and_model(cheap, tmp_path):
     base, out, merged = converted(tmp_path), tmp_path / "out", tmp_path / "merged"
-    pool = write_pool(tmp_path / "pool", (32, 48))
+    pool = write_dataset(tmp_path / "pool", (32, 48))
     given = ["--init", base, "--data", pool, "--steps", 1, "--batch", 1]
     run("tiny", "--devices", 1, *given, "--out", out)
     for kind in ("model", "adapter"):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from train_runs import run, same, write_pool
+from train_runs import run, same, write_dataset
 
 from roge_jax import checkpoint, config, cost, model
 from roge_jax.checkpoint import load_model, open_model, save_model
@@ -23,7 +23,7 @@ from roge_jax.weights.sources import Stored
 def start(common, tmp_path):
     """The model that `tiny` is here, random, in bfloat16; with the pool in `tmp_path / "pool"`."""
     cfg = config.preset("tiny")
-    write_pool(tmp_path / "pool", (32, 48))
+    write_dataset(tmp_path / "pool", (32, 48))
     save_model(tmp_path / "start", model.init(jax.random.key(3), cfg), cfg)
     return tmp_path / "start"
 

@@ -1,6 +1,6 @@
-"""Pools: many rendered sequences on disk.
+"""Datasets: many rendered sequences on disk.
 
-A pool is a folder of shards. Shard k is `shard_00000.rgb.npy` (uint8 `[scenes,f,h,w,3]`),
+A dataset is a folder of shards. Shard k is `shard_00000.rgb.npy` (uint8 `[scenes,f,h,w,3]`),
 `shard_00000.depth.npy` (float16, optional) and `shard_00000.npz` (`seeds [scenes]`, `K` and `c2w`
 float64 `[scenes,f,...]`). The .npz is renamed into place last, so a shard with one is complete.
 """
@@ -20,14 +20,19 @@ from typing import Any
 
 import numpy as np
 
+from roge_jax.core.lazy import renamed
 from roge_jax.errors import UserError
 from roge_jax.files.fields import read_json
 from roge_jax.files.folders import put
 
+__getattr__ = renamed(
+    __name__, Pool="Dataset", read_pool="read_dataset", write_pool="write_dataset"
+)
+
 
 @dataclasses.dataclass(frozen=True)
-class Pool:
-    """The finished shards of a pool; `pool[i]` is one scene, its frames still on disk.
+class Dataset:
+    """The finished shards of a dataset; `dataset[i]` is one scene, its frames still on disk.
 
     `seeds [n]`, `K [n,f,3,3]`, `c2w [n,f,4,4]` (OpenCV, float64) are in memory; `rgb` and `depth`
     are one memory map per shard.
@@ -54,7 +59,7 @@ class Pool:
         return scene | {"depth": self.depth[shard][row]} if self.depth else scene
 
 
-def write_pool(
+def write_dataset(
     path: str | Path,
     seeds: Sequence[int],
     frames: int,
@@ -69,12 +74,12 @@ def write_pool(
     handheld: bool = False,
     textures: Path | None = None,
 ) -> None:
-    """Render `sample_sequence` of every seed into a pool with one-thread worker processes.
+    """Render `sample_sequence` of every seed into a dataset with one-thread worker processes.
 
     With `textures`, a folder of pictures, every shard has a set of its own (`load_textures`). Finished shards are kept, so an interrupted call is resumed by repeating it.
 
     Raises:
-        UserError: no seeds, seeds of both splits, a folder that holds a pool with other settings
+        UserError: no seeds, seeds of both splits, a folder that holds a dataset with other settings
             or that another process is writing.
     """
     from roge_jax.procedural.scenes import HELDOUT_SEED, split_of
@@ -83,11 +88,11 @@ def write_pool(
     path = Path(path)
     wanted = np.asarray(seeds, np.int64)
     if not len(wanted):
-        raise UserError(f"{path}: no seeds were given; a pool needs at least one scene.")
+        raise UserError(f"{path}: no seeds were given; a dataset needs at least one scene.")
     if len({split_of(seed) for seed in wanted}) > 1:
         raise UserError(
             f"{path}: seeds {wanted.min()} .. {wanted.max()} mix training and held-out scenes; "
-            f"write seeds from {HELDOUT_SEED} on into a pool of their own."
+            f"write seeds from {HELDOUT_SEED} on into a dataset of their own."
         )
     settings: dict[str, Any] = {
         "frames": frames,
@@ -123,14 +128,14 @@ def _sole_writer(path: Path) -> Iterator[None]:
 
 def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int) -> None:
     record = path / "pool.json"
-    old = read_json(record, "record of a pool") if record.exists() else settings
+    old = read_json(record, "record of a dataset") if record.exists() else settings
     if not isinstance(old, dict):
-        raise UserError(f"{record} is no record of a pool: write into another folder.")
+        raise UserError(f"{record} is no record of a dataset: write into another folder.")
     if old != settings:
         wrong = ", ".join(
             f"{k} {old.get(k)} (asked: {v})" for k, v in settings.items() if old.get(k) != v
         )
-        raise UserError(f"{record} holds a pool with {wrong}; write into another folder.")
+        raise UserError(f"{record} holds a dataset with {wrong}; write into another folder.")
     record.write_text(json.dumps(settings, indent=1) + "\n")
     jobs = _missing(path, seeds, settings)
     # Threads lose on this work; one-thread processes scale. Workers read these when JAX starts.
@@ -234,8 +239,8 @@ def _write_shard(job: tuple[Path, np.ndarray, dict]) -> tuple[str, float]:
     return stem.name, time.perf_counter() - began
 
 
-def read_pool(path: str | Path) -> Pool:
-    """The finished shards of a pool written by `write_pool` (also while it is being written).
+def read_dataset(path: str | Path) -> Dataset:
+    """The finished shards of a dataset written by `write_dataset` (also while it is being written).
 
     Raises:
         UserError: the folder has no finished shard.
@@ -245,7 +250,7 @@ def read_pool(path: str | Path) -> Pool:
     if not stems:
         raise UserError(
             f"{path} holds no finished shard_*.npz; write one with "
-            f"`python -m roge_jax.procedural pool --out {path}`."
+            f"`python -m roge_jax.procedural dataset --out {path}`."
         )
     cameras: list[dict[str, np.ndarray]] = []
     pixels: dict[str, list[np.ndarray]] = {"rgb": [], "depth": []}
@@ -259,16 +264,16 @@ def read_pool(path: str | Path) -> Pool:
                     maps.append(np.load(array, mmap_mode="r"))
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
             raise UserError(
-                f"{stem}: this shard is damaged or incomplete ({error}): remove its files and write the pool again."
+                f"{stem}: this shard is damaged or incomplete ({error}): remove its files and write the dataset again."
             ) from None
         rgb, shape = pixels["rgb"][-1], cameras[-1]["K"].shape
         if rgb.ndim != 5 or rgb.dtype != np.uint8 or rgb.shape[:2] != shape[:2]:
             raise UserError(
                 f"{stem}: its pictures are {rgb.dtype} {rgb.shape}, its K {shape}: remove its files and write the "
-                "pool again."
+                "dataset again."
             )
     lengths = [len(entry["seeds"]) for entry in cameras]
-    return Pool(
+    return Dataset(
         rgb=pixels["rgb"],
         depth=pixels["depth"],
         starts=np.cumsum([0, *lengths[:-1]]),
