@@ -206,3 +206,24 @@ def test_the_checks_see_faults(tmp_path):
     assert blocks(page.read_text()) == [("sample", ["--seed", "1"]), ("check", ["a"])]
     with pytest.raises(Exception, match="nothing"):
         entry.parse(sample.parser(), ["--nothing"])
+
+
+# How the help of a shared option begins, in every program that has it.
+MEANINGS = {
+    "--context": "how many photos",
+    "--scale": "divisor of all positions, in units of the scene",
+    "--tolerance": "spend no more than this needs",
+}
+
+
+@pytest.mark.parametrize("option", MEANINGS)
+def test_an_option_means_the_same_in_every_program(option):
+    from roge_jax import view
+
+    helps = {
+        name: action.help
+        for name, module in (PARSERS | {"view": view}).items()
+        for action in module.parser()._actions
+        if option in action.option_strings
+    }
+    assert helps and all(said.startswith(MEANINGS[option]) for said in helps.values()), helps
