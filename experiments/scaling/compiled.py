@@ -58,7 +58,9 @@ def compile_case(program: str, device: str, sizes: tuple[int, int, int]) -> dict
         stage = stages.lora_stage(100, frames=cfg.frames, hires=hires)
         if program == "transformer step":
             stage = stages.once_encoded(stage, cfg, 8)
-        stage = dataclasses.replace(stage, remat="full", batch=sizes[0] * sizes[1])
+        stage = dataclasses.replace(
+            stage, remat="full", products="bfloat16", batch=sizes[0] * sizes[1]
+        )
         said = training.compiled_step(cfg, stage, m=M, name=device, sizes=sizes, dtype="bfloat16")
         if program != "transformer step":
             with target.use(device):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config import DiTConfig
+from ..core import products
 from ..core.attention import PIECES, attention, is_attention, merge_heads, split_heads
 from ..core.layers import (
     gelu,
@@ -107,6 +108,7 @@ def time_wave(timestep: jax.Array, channels: int) -> jax.Array:
     return jnp.concatenate([c, s])
 
 
+@products.use(None)
 def time_embed(p: Tree, timestep: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Timestep 1000 * sigma, a scalar -> e [d] (modulates the head) and e0 [6, d] (modulates every block)."""
     p = p["time_embed"]
@@ -208,7 +210,9 @@ def cross_kv(p: Tree, rows: jax.Array, *, cfg: DiTConfig, split: Split = "image_
     if n:
         kv["k_img"] = rms_norm(p["norm_k_img"], linear(p["k_img"], rows[:n]), eps=EPS)
         kv["v_img"] = linear(p["v_img"], rows[:n])
-    dtype = p["q"]["kernel"].dtype  # attention's own input dtype, so a cache loses nothing
+    dtype = products.dtype_of(
+        p["q"]["kernel"]
+    )  # attention's own input dtype, so a cache loses nothing
     return {name: split_heads(x, cfg.heads).astype(dtype) for name, x in kv.items()}
 
 
@@ -234,7 +238,7 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
     q = rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS)
     k = rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS)
     q, k, v = (split_heads(by_tokens(y), heads) for y in (q, k, linear(p["v"], x)))
-    dtype = p["q"]["kernel"].dtype
+    dtype = products.dtype_of(p["q"]["kernel"])
     q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v, dtype)
     y = merge_heads(attention(q, k, v, dtype=dtype, over="attention_heads"))
     return linear(p["o"], constrain(y, ("tokens", None)))
@@ -242,7 +246,7 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
 
 def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array:
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
-    dtype = p["q"]["kernel"].dtype
+    dtype = products.dtype_of(p["q"]["kernel"])
     q = by_tokens(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS))
     q = split_heads(q, heads)
 
@@ -316,6 +320,7 @@ def dit_blocks(
     return x
 
 
+@products.use(None)
 def head(p: Tree, x: jax.Array, e: jax.Array, *, grid: tuple[int, int, int], patch: int):
     """Tokens [l, d] of a (slots, rows, columns) grid -> velocity [t, lh, lw, c], modulated by e [d] (not e0)."""
     t, rows, columns = grid
