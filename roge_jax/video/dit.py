@@ -29,6 +29,7 @@ from ..core.layers import (
     unpatchify,
 )  # fmt: skip
 from ..core.params import Spec, Tree, normal, stack, uniform, zeros
+from ..core.recompute import from_rounded
 from ..core.rope import frequencies, rotate_pairs
 from ..core.sharding import by_heads, constrain
 
@@ -284,10 +285,15 @@ POLICIES: dict[Remat, Any] = {
 
 
 def rematerialise(f, remat: Remat):
-    """`f` as a scan body whose backward pass recomputes everything (full), all but what attention returns
-    (attention), all but products with weights and attention in pieces (dots), or nothing (none)."""
+    """f(x, rest) -> y as a loop's body whose backward pass recomputes everything (full), all but what attention returns
+    (attention), all but products with weights and attention in pieces (dots), or nothing (none).
+
+    `full` keeps x in bfloat16 where products are asked for in it.
+    """
     if remat == "none":
         return f
+    if remat == "full" and products.rounded(products.BF16):
+        return from_rounded(f)
     return jax.checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
 
 
@@ -309,14 +315,16 @@ def dit_blocks(
     assert (rows is None) or (kv is None), "context rows or their keys and values, not both"
     assert bool(cfg.text_len) == (rows is not None or kv is not None), "context iff text_len > 0"
 
-    def step(x, layer):
-        p, kv = layer
+    def one(x, rest):
+        (p, kv), (e0, angles, rows) = rest
         if rows is not None:
             kv = cross_kv(p, rows, cfg=cfg, split=split)
-        return constrain(block(p, x, e0, angles, kv, heads=cfg.heads), ("tokens", None)), None
+        return constrain(block(p, x, e0, angles, kv, heads=cfg.heads), ("tokens", None))
 
+    shared, step = (e0, angles, rows), rematerialise(one, remat)
     x = constrain(x, ("tokens", None))
-    x, _ = jax.lax.scan(rematerialise(step, remat), x, (p["blocks"], kv), unroll=unroll)
+    layers = p["blocks"], kv
+    x, _ = jax.lax.scan(lambda x, layer: (step(x, (layer, shared)), None), x, layers, unroll=unroll)
     return x
 
 

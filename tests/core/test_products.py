@@ -11,7 +11,7 @@ import pytest
 from parity import rel_l2
 
 from roge_jax import config
-from roge_jax.core import hlo, layers, params, products, program, target
+from roge_jax.core import hlo, layers, params, products, program, recompute, target
 from roge_jax.core.attention import attention, scores_limit
 from roge_jax.errors import UserError
 from roge_jax.training import estimate, stages, start
@@ -117,14 +117,14 @@ def multiplied(traced, times=1):
     return found
 
 
-def transformer_gradient(cfg):
-    """The gradient of one block of `cfg` by its weights, and its abstract arguments."""
+def transformer_gradient(cfg, remat="dots"):
+    """The gradient of the blocks of `cfg` by their weights, and its abstract arguments."""
     specs = {"blocks": params.stack(dit.block_specs(cfg), cfg.depth)}
     tokens = 7 * 8 * 4
     angles = jnp.asarray(dit.rope_angles(range(7), 8, 4, cfg.width // cfg.heads))
 
     def loss(p, x, e0):
-        return jnp.square(dit.dit_blocks(p, x, e0, angles, cfg=cfg, remat="dots")).mean()
+        return jnp.square(dit.dit_blocks(p, x, e0, angles, cfg=cfg, remat=remat)).mean()
 
     shapes = (tokens, cfg.width), (6, cfg.width)
     arrays = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
@@ -179,3 +179,60 @@ def test_a_stage_asks_for_its_products():
     own = [x for x in found if not re.search("vae|look_up", x[2])]
     wide = sum(work for (dtype, _), work, _ in own if dtype == "float32")
     assert 0 < wide < 0.02 * sum(work for _, work, _ in own), "time and head"
+
+
+# ---- recomputation from rounded inputs ------------------------------------------------------------
+
+
+def deep(f, x, stack, shared):
+    x, _ = jax.lax.scan(lambda x, w: (f(x, (w, shared)), None), x, stack)
+    return jnp.sin(x).sum()
+
+
+def layer(x, rest):
+    (w, b), shared = rest
+    return x + jnp.tanh(x @ w + shared[None]) * b[None]
+
+
+def layers_of(depth=5, width=16):
+    stack = normal(depth, width, width, seed=1) / 4, normal(depth, width, seed=2)
+    return normal(24, width), stack, normal(width, seed=3)
+
+
+def test_recomputed_from_rounded_inputs_values_are_the_same_and_gradients_a_rounding_away():
+    arguments = layers_of()
+    for asked in ((0,), (0, 1, 2)):
+        one, other = (
+            jax.value_and_grad(functools.partial(deep, f), asked)(*arguments)
+            for f in (layer, recompute.from_rounded(layer))
+        )
+        assert one[0] == other[0]
+        for a, b in zip(*map(jax.tree.leaves, (other[1], one[1])), strict=True):
+            assert 0 < rel_l2(a, b) < 2 * ROUNDED, asked
+
+
+def test_it_keeps_inputs_in_two_bytes_and_copies_no_weights():
+    x, stack, shared = layers_of(width=8)
+    kept = {}
+    for name, f in (
+        ("float32", jax.checkpoint(layer, prevent_cse=False)),
+        ("bfloat16", recompute.from_rounded(layer)),
+    ):
+        traced = program.trace(jax.grad(functools.partial(deep, f)), x, stack, shared)
+        loops = [op for op in traced.ops if op.name == "scan"]
+        kept[name] = [traced.values[v] for v in loops[0].writes]
+    told = {name: {(v.shape, str(v.dtype)) for v in values} for name, values in kept.items()}
+    assert told["float32"] == {((24, 8), "float32"), ((5, 24, 8), "float32")}
+    assert told["bfloat16"] == {((24, 8), "float32"), ((5, 24, 8), "bfloat16")}
+
+
+def test_the_transformer_keeps_them_so_where_products_are_asked_for_in_bfloat16():
+    cfg = dataclasses.replace(config.preset("tiny").dit, text_len=0, depth=3)
+    gradient, arguments = transformer_gradient(cfg, remat="full")
+
+    def kept(dtype):
+        traced = program.trace(in_dtype(dtype, gradient), *arguments)
+        stacks = [v for v in traced.values if getattr(v, "shape", ())[:2] == (3, 224)]
+        return {str(v.dtype) for v in stacks}
+
+    assert kept(None) == {"float32"} and kept("bfloat16") == {"bfloat16"}
