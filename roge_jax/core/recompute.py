@@ -1,5 +1,6 @@
 """Recomputation from rounded inputs: what `jax.checkpoint` does, keeping half as much."""
 
+import contextvars
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -17,7 +18,12 @@ def from_rounded(f: Callable[[jax.Array, Any], jax.Array]) -> Callable[[jax.Arra
 
     def run(x: jax.Array, rest: Any) -> jax.Array:
         leaves, shape = jax.tree.flatten(rest)
-        return _run(lambda x, leaves: f(x, jax.tree.unflatten(shape, leaves)), x, leaves)
+        around = contextvars.copy_context()  # what is set here holds when f is traced again, later
+
+        def inside(x, leaves):
+            return around.copy().run(f, x, jax.tree.unflatten(shape, leaves))
+
+        return _run(inside, x, leaves)
 
     return run
 
