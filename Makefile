@@ -31,7 +31,7 @@ FIGURES := $(FIRST) $(patsubst %.__main__,%,$(filter-out $(FIRST) $(DRAWN) $(COM
 PYTEST := $(RUN) -m pytest -n auto --maxprocesses 8 --dist worksteal -o console_output_style=count --durations 8
 
 .DEFAULT_GOAL := help
-.PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators check lint format figures compare notebook docs clean
+.PHONY: help sample train evaluate smoke test test-slow test-parity test-accelerators scaling check lint format figures compare notebook docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -60,6 +60,10 @@ test-parity: $(PARITY)  ## tests against PyTorch implementations (installs torch
 
 test-accelerators: $(AOT)  ## programs compiled for GPUs that need not be there (installs their compiler, 0.6 GB)
 	$(AOT_VENV)/bin/python -m pytest -q tests/core/test_aot.py $(ARGS)
+
+scaling: $(AOT)  ## what the compiler of GPUs says of every program (hours on two cores); writes experiments/results and docs/results/scaling.md
+	$(AOT_VENV)/bin/python -m $(COMPILED) $(ARGS)
+	$(AOT_VENV)/bin/python -m experiments.scaling.layouts
 
 check: lint test  ## what CI runs
 

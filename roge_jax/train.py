@@ -18,6 +18,7 @@ from .files.entry import number
 
 
 def parser() -> argparse.ArgumentParser:
+    from .core.products import DTYPES
     from .core.target import TARGETS
 
     p = argparse.ArgumentParser(
@@ -76,8 +77,14 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--frozen-dtype",
-        choices=("float32", "bfloat16"),
+        choices=DTYPES,
         help="of weights that do not train (default: bfloat16 on accelerators, float32 on a CPU)",
+    )
+    p.add_argument(
+        "--products",
+        choices=DTYPES,
+        help="what matrix products of the transformers and their gradients read; sums are float32 (default: as\n"
+        "--frozen-dtype)",
     )
     p.add_argument(
         "--remat",
@@ -256,6 +263,7 @@ def choose(args: argparse.Namespace, cfg):
     changes = {"steps": args.steps, "batch": args.batch}
     changes = {k: v for k, v in changes.items() if v}
     changes["remat"] = args.remat or estimate.default_remat(cfg)
+    changes["products"] = start.products_dtype(args.products, args.frozen_dtype)
     chosen = [dataclasses.replace(stage, **changes) for stage in chosen]
     if args.encode_once:
         chosen = stages_.all_once_encoded(chosen, cfg, args.encode_once)
@@ -279,13 +287,13 @@ def dry_run(args: argparse.Namespace) -> str:
     if init != "scratch":
         preset, cfg = cfg, checkpoint.load_config(checkpoint.find_model(init))
         check_preset(preset, cfg, init)
-    cfg, chosen = choose(args, cfg)
     large = count(model.specs(cfg)) > estimate.LARGE
     if args.compile:
         aot.by_the_cpu()
     with target.use(args.target or ("h100" if large and target.machine() == "cpu" else None)):
         if args.compile:
             aot.check(target.name())
+        cfg, chosen = choose(args, cfg)
         return "\n\n".join(planned(args, cfg, stage) for stage in chosen)
 
 

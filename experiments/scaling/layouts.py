@@ -36,7 +36,7 @@ def sized(height: int, width: int, frames: int = 81) -> config.RoGeConfig:
 
 def stage(cfg: config.RoGeConfig, remat: str, scenes: int, *, recon_trains: bool) -> stages.Stage:
     found = stages.lora_stage(100, frames=cfg.frames, hires=not recon_trains)
-    return dataclasses.replace(found, remat=remat, batch=scenes)
+    return dataclasses.replace(found, remat=remat, batch=scenes, products="bfloat16")
 
 
 def planned(cfg, m: int, remat: str, sizes, *, recon_trains: bool) -> estimate.Estimate:

@@ -4,14 +4,14 @@ import contextlib
 import contextvars
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
-from . import target
+from . import products, target
 from .sharding import constrain, current
 
 SCORES_BYTES = 1e9  # of scores that are stored at a time, where they are stored at all
@@ -25,7 +25,7 @@ def attention(
 ) -> jax.Array:
     """softmax(q k^T / sqrt(e)) v for q [.., l, k, e] and k, v [.., s, k, e]; no mask. Returns float32.
 
-    `dtype` is that of the matrix products' inputs; with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
+    `dtype` is that of the matrix products' inputs (`core.products`); with bfloat16 on a GPU the cuDNN flash kernel runs, which needs
     no memory for the l x s scores. Elsewhere scores above a limit are not stored: queries are taken in pieces, and
     the gradient computes their scores once more. The limit is `SCORES_BYTES`; on a lone CPU it is `CACHE_BYTES` where
     a head has much of that, and every head of every sequence comes by itself: fresh memory for the scores of all
@@ -40,20 +40,38 @@ def attention(
         q, k, v = (x.astype(dtype).reshape(-1, *x.shape[-3:]) for x in (q, k, v))
         y = _fused(q, k, v, scale, over)
         return y.reshape(*lead, *y.shape[1:]).astype(jnp.float32)
-    q, k, v = (jnp.swapaxes(x, -3, -2).astype(dtype) for x in (q * scale, k, v))
+    rounded = products.rounded(dtype)
+    one = _rounded if rounded else _recomputed
+    q, k, v = (x.astype(jnp.float32 if rounded else dtype) for x in (q * scale, k, v))
+    q, k, v = (_heads_first(x, apart=rounded) for x in (q, k, v))
     lone_cpu = target.platform() == "cpu" and current() is None
     large = lone_cpu and 4.0 * q.shape[-2] * k.shape[-2] > CACHE_BYTES / 8
     limit = _LIMIT.get() or (CACHE_BYTES if large else SCORES_BYTES)
     if _scores_bytes(q, k) <= limit:
-        y, _ = _weighted_sum(q, k, v)
+        y = _rounded(q, k, v) if rounded else _weighted_sum(q, k, v)[0]
     elif lone_cpu:
         # An axis of one stays: products with a batch axis are those that a policy of `jax.checkpoint` can tell apart.
         heads = tuple(x.reshape(-1, 1, *x.shape[-2:]) for x in (q, k, v))
-        y = jax.lax.map(lambda head: _in_pieces(head[0], head[1], head[2], limit), heads)
+        y = jax.lax.map(lambda head: _in_pieces(one, head[0], head[1], head[2], limit), heads)
         y = y.reshape(*q.shape[:-1], v.shape[-1])
     else:
-        y = _in_pieces(q, k, v, limit)
-    return checkpoint_name(jnp.swapaxes(y, -3, -2), "attention")
+        y = _in_pieces(one, q, k, v, limit)
+    return checkpoint_name(_heads_last(y, apart=rounded), "attention")
+
+
+def _heads_first(x: jax.Array, *, apart: bool) -> jax.Array:
+    """[.., l, k, e] -> [.., k, l, e]; `apart`: on a CPU head by head. XLA folds a transpose into the product that reads
+    it, and takes bfloat16 on a CPU in products without one only (`products.transposed`)."""
+    if not apart or target.platform() != "cpu":
+        return jnp.swapaxes(x, -3, -2)
+    return jnp.stack([x[..., head, :] for head in range(x.shape[-2])], -3)
+
+
+def _heads_last(x: jax.Array, *, apart: bool) -> jax.Array:
+    """The inverse of `_heads_first`, whose gradient goes its way."""
+    if not apart or target.platform() != "cpu":
+        return jnp.swapaxes(x, -3, -2)
+    return jnp.stack([x[..., head, :, :] for head in range(x.shape[-3])], -2)
 
 
 def _fused(q: jax.Array, k: jax.Array, v: jax.Array, scale: float, over: str | None) -> jax.Array:
@@ -112,16 +130,16 @@ def _scores_bytes(q: jax.Array, k: jax.Array) -> float:
     return 4.0 * math.prod(q.shape[:-1]) * k.shape[-2]
 
 
-def _in_pieces(q: jax.Array, k: jax.Array, v: jax.Array, limit: float) -> jax.Array:
-    """`_recomputed` of q [.., l, e], as many queries at a time as `limit` bytes of scores allow."""
+def _in_pieces(one: Callable, q: jax.Array, k: jax.Array, v: jax.Array, limit: float) -> jax.Array:
+    """`one` of q [.., l, e], as many queries at a time as `limit` bytes of scores allow."""
     *outer, length, width = q.shape
     pieces = math.ceil(_scores_bytes(q, k) / limit)
     if pieces == 1:
-        return _recomputed(q, k, v)
+        return one(q, k, v)
     size = -(-length // pieces)
     q = jnp.pad(q, [(0, 0)] * len(outer) + [(0, size * pieces - length), (0, 0)])
     q = jnp.moveaxis(q.reshape(*outer, pieces, size, width), -3, 0)
-    y = jnp.moveaxis(jax.lax.map(lambda q: _recomputed(q, k, v), q), 0, -3)
+    y = jnp.moveaxis(jax.lax.map(lambda q: one(q, k, v), q), 0, -3)
     return y.reshape(*outer, pieces * size, v.shape[-1])[..., :length, :]
 
 
@@ -159,6 +177,33 @@ def _tangent(q, k, v, y, log_total, dq, dk, dv):
     dp = p * ds
     dy = _product("...qs,...se->...qe", p, dv) + _product("...qs,...se->...qe", dp, v)
     return dy - dp.sum(-1, keepdims=True) * y
+
+
+@jax.custom_vjp
+def _rounded(q: jax.Array, k: jax.Array, v: jax.Array) -> jax.Array:
+    """softmax(q k^T) v with products of bfloat16, those of the gradient too; it keeps what `_recomputed` keeps."""
+    return _rounded_forward(q, k, v)[0]
+
+
+def _rounded_forward(q, k, v):
+    q, k, v = (x.astype(jnp.bfloat16) for x in (q, k, v))
+    y, log_total = (checkpoint_name(x, PIECES) for x in _weighted_sum(q, k, v))
+    return y, (q, k, v, y, log_total)
+
+
+@jax.named_scope("scores")
+def _rounded_backward(kept, dy):
+    q, k, v, y, log_total = kept
+    along = (dy * y).sum(-1, keepdims=True)
+    dy = dy.astype(jnp.bfloat16)
+    p = jnp.exp(_product("...qe,...se->...qs", q, k) - log_total)
+    ds = p * (_product("...qe,...se->...qs", dy, v) - along)
+    p, ds = p.astype(jnp.bfloat16), ds.astype(jnp.bfloat16)
+    dq = _product("...qs,...se->...qe", ds, k)
+    return dq, products.transposed(ds, q), products.transposed(p, dy)
+
+
+_rounded.defvjp(_rounded_forward, _rounded_backward)
 
 
 def _product(axes: str, a: jax.Array, b: jax.Array) -> jax.Array:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 
 from . import target
 from .params import Spec, Tree, fan_in, ones, zeros
+from .products import product
 
 
 def lift(v: jax.Array, ndim: int) -> jax.Array:
@@ -13,13 +14,12 @@ def lift(v: jax.Array, ndim: int) -> jax.Array:
 
 
 def matmul(x: jax.Array, kernel: jax.Array) -> jax.Array:
-    """x [.., d_in] @ kernel [d_in, d_out], inputs in the kernel's dtype if that is 16 bit, accumulated in float32.
+    """x [.., d_in] @ kernel [d_in, d_out], accumulated in float32; `core.products` says what it reads.
 
     The product is one of two matrices: XLA's CPU compiler transposes whole activations where the gradient of the
     kernel sums over several axes.
     """
-    rows = x.reshape(-1, x.shape[-1]).astype(kernel.dtype)
-    y = jnp.matmul(rows, kernel, preferred_element_type=jnp.float32)
+    y = product(x.reshape(-1, x.shape[-1]), kernel)
     return y.reshape(*x.shape[:-1], y.shape[-1])
 
 

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..core import target
+from ..core import products, target
 from ..core.layers import (
     conv2d,
     conv2d_specs,
@@ -130,6 +130,7 @@ def _cells(images: jax.Array, side: int = CELL) -> jax.Array:
 
 
 @jax.named_scope("look_up")
+@products.use(None)
 def look_up(
     p: Tree,
     features: jax.Array,

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..config import RendererConfig
+from ..core import products
 from ..core.attention import attention, merge_heads, split_heads
 from ..core.layers import (
     layer_norm,
@@ -61,7 +62,7 @@ def attend(
     v = split_heads(linear(p["v"], context), heads)
     if rq is not None and rk is not None:
         q, k, v = to_query(rq, q), _keys(rk, k), _keys(rk, v)
-    dtype = p["q"]["kernel"].dtype
+    dtype = products.dtype_of(p["q"]["kernel"])
     # One matrix product for all views, unless they are on different devices.
     if context.shape[0] == 1 and x.shape[0] > 1 and ways("seq") == 1:
         y = attention(q.reshape(1, -1, *q.shape[2:]), k, v, dtype=dtype).reshape(q.shape)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config import EncoderConfig
+from ..core import products
 from ..core.attention import attention, merge_heads, split_heads
 from ..core.layers import (
     layer_norm,
@@ -79,7 +80,7 @@ def self_attention(p: Tree, x: jax.Array, heads: int, *, eps: float, rotate=None
         q, k, v = to_query(relative, q), to_key(relative, k), to_key(relative, v)
     elif rotate is not None:
         q, k = rotate(q), rotate(k)
-    dtype = p["qkv"]["kernel"].dtype
+    dtype = products.dtype_of(p["qkv"]["kernel"])
     if relative is None:
         return linear(p["proj"], merge_heads(attention(q, k, v, dtype=dtype)))
     flat = [t.reshape(1, -1, *t.shape[2:]) for t in (q, k, v)]

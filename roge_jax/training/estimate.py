@@ -23,7 +23,7 @@ from ..recon.vggt import encoder_grid
 from . import encoded
 from .loop import initial_state, make_step
 from .optim import make_optimiser
-from .stages import OBJECTIVES, Stage, stage_config, stage_specs
+from .stages import Stage, objective_of, stage_config, stage_specs
 
 # Names that `model` gives to its parts, as shown to people.
 PARTS = {
@@ -110,7 +110,7 @@ def abstract_step(
     working = stage_config(config, stage)
     specs, frozen_specs = stage_specs(config, stage)
     optimiser = make_optimiser(stage.optim, specs, stage.steps)
-    objective = functools.partial(OBJECTIVES[stage.objective], config=working, stage=stage)
+    objective = objective_of(working, stage)
     state = abstract_state(config, stage)
     key = jax.eval_shape(lambda: jax.random.key(0))
     batch = abstract_batch(working, stage, m, scenes)
@@ -317,7 +317,7 @@ def report(
     kind = f" of {device.title}" if target.name() in target.TARGETS else ""
     lines = [
         f"stage     {stage.name} of {config.name}: {counts['trained'] / 1e6:,.1f} M parameters train, "
-        f"{counts['frozen'] / 1e6:,.1f} M are frozen ({dtype})",
+        f"{counts['frozen'] / 1e6:,.1f} M are frozen ({dtype}); products read {stage.products or dtype}",
         f"step      {stage.batch} scenes of {m} photos and {stage.views.targets} targets at "
         f"{working.height}x{working.width} (reconstruction at {working.recon_height}x{working.recon_width})"
         + (f", {stage.draws} noise levels each" if stage.draws > 1 else ""),

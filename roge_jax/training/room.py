@@ -34,7 +34,7 @@ def check_layout(
     loop.check_batch(stage.batch, mesh)
     for specs in stage_specs(config, stage):
         sharding.shardings(specs, mesh)
-    if target.fused(dtype) and stage.objective in ("prior", "joint", "encoded"):
+    if target.fused(stage.products or dtype) and stage.objective in ("prior", "joint", "encoded"):
         sharding.check_heads(config.dit.heads, mesh)
 
 

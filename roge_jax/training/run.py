@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import functools
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -75,6 +74,7 @@ def run_stage(
         "stage": stage.name,
         "steps": int(state["step"]),
         "skipped": int(state["skipped"]),
+        "products": stage.products or dtype,
         "base": base,
         "base_provenance": before,
     }
@@ -159,7 +159,7 @@ def _fit(
     working = stages.stage_config(config, stage)
     views = dataclasses.replace(stage.views, size=(working.height, working.width))
     stage = dataclasses.replace(stage, views=views)
-    objective = functools.partial(stages.OBJECTIVES[stage.objective], config=working, stage=stage)
+    objective = stages.objective_of(working, stage)
     rows = distributed.local_rows(mesh, stage.batch)
     batches, encode = start.samples(
         stage, source, params, working, options.seed, rows, out / "encoded", resume=options.resume

@@ -7,6 +7,7 @@ paper's end-to-end step; `hires` is its second stage, at higher resolution with 
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import jax
@@ -15,6 +16,7 @@ import numpy as np
 
 from .. import fusion, model, preview
 from ..config import RoGeConfig
+from ..core import products
 from ..core.lora import attach
 from ..core.params import Tree, loaded
 from ..data.views import ViewConfig, draw_batch
@@ -38,6 +40,9 @@ class Stage:
     draws: int = 1  # noise levels per scene and step
     lora: bool = False  # add LoRA factors to what trains
     remat: dit.Remat = "dots"  # what the transformer's backward pass recomputes
+    products: str | None = (
+        None  # what matrix products read (`core.products`); None: the dtype in which weights are kept
+    )
     crop: int | None = None  # side of random square crops (VAE stages)
     recon_shrink: int = 1  # divides the size at which the reconstruction works
     lookup: bool = False  # train the photo look-up on a finished reconstruction
@@ -116,6 +121,18 @@ def encoded_objective(trainable, frozen, batch, key, *, config, stage):
     term = functools.partial(encoded.flow_term, **options)
     loss = model.over_scenes(term, params, batch, keys).mean()
     return loss, {"flow": loss}
+
+
+def objective_of(config: RoGeConfig, stage: Stage) -> Callable:
+    """objective(trainable, frozen, batch, key) -> (loss, terms) of a stage; `config` is its own (`stage_config`)."""
+
+    def objective(trainable, frozen, batch, key):
+        with products.use(stage.products):
+            return OBJECTIVES[stage.objective](
+                trainable, frozen, batch, key, config=config, stage=stage
+            )
+
+    return objective
 
 
 LEVELS = 0.3  # weight of the look-up's levels beside its picture

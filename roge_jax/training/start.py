@@ -12,7 +12,7 @@ import jax
 from .. import checkpoint
 from ..checkpoint import find_model, load_provenance, model_fingerprint
 from ..config import RoGeConfig
-from ..core import distributed, target
+from ..core import distributed, products, target
 from ..core.params import Tree, loaded
 from ..cost import kept_as
 from ..data.source import open_source
@@ -59,6 +59,7 @@ def hold_settings(
         "seed": seed,
         "learning rate": stage.optim.learning_rate,
         "frozen dtype": frozen_dtype,
+        "dtype of products": stage.products or frozen_dtype,
         "start contents": model_fingerprint(params, config, "float32"),
         "data contents": "procedural scenes",
         "samples encoded once": stage.stored,
@@ -154,6 +155,20 @@ def find_devices(count: int | None) -> list[jax.Device]:
 def kept_dtype(given: str | None) -> str:
     """What frozen matrices are kept in: --frozen-dtype, or what suits the devices."""
     return given or ("float32" if target.platform() == "cpu" else "bfloat16")
+
+
+def products_dtype(given: str | None, frozen: str | None) -> str:
+    """What matrix products read: --products, or what frozen matrices are kept in where the device multiplies it.
+
+    Raises: UserError for bfloat16 on a CPU that only multiplies float32.
+    """
+    able = target.platform() != "cpu" or products.cpu_units()
+    if given == "bfloat16" and not able:
+        raise UserError(
+            "--products bfloat16: this CPU has no units for it (amx_bf16 or avx512_bf16), and is faster in float32: "
+            "leave --products out."
+        )
+    return given or (kept_dtype(frozen) if able else "float32")
 
 
 def provenance(start: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config import DiTConfig
+from ..core import products
 from ..core.attention import PIECES, attention, is_attention, merge_heads, split_heads
 from ..core.layers import (
     gelu,
@@ -28,6 +29,7 @@ from ..core.layers import (
     unpatchify,
 )  # fmt: skip
 from ..core.params import Spec, Tree, normal, stack, uniform, zeros
+from ..core.recompute import from_rounded
 from ..core.rope import frequencies, rotate_pairs
 from ..core.sharding import by_heads, constrain
 from ..core.stepping import checkpoint
@@ -108,6 +110,7 @@ def time_wave(timestep: jax.Array, channels: int) -> jax.Array:
     return jnp.concatenate([c, s])
 
 
+@products.use(None)
 def time_embed(p: Tree, timestep: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Timestep 1000 * sigma, a scalar -> e [d] (modulates the head) and e0 [6, d] (modulates every block)."""
     p = p["time_embed"]
@@ -209,7 +212,9 @@ def cross_kv(p: Tree, rows: jax.Array, *, cfg: DiTConfig, split: Split = "image_
     if n:
         kv["k_img"] = rms_norm(p["norm_k_img"], linear(p["k_img"], rows[:n]), eps=EPS)
         kv["v_img"] = linear(p["v_img"], rows[:n])
-    dtype = p["q"]["kernel"].dtype  # attention's own input dtype, so a cache loses nothing
+    dtype = products.dtype_of(
+        p["q"]["kernel"]
+    )  # attention's own input dtype, so a cache loses nothing
     return {name: split_heads(x, cfg.heads).astype(dtype) for name, x in kv.items()}
 
 
@@ -235,7 +240,7 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
     q = rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS)
     k = rms_norm(p["norm_k"], linear(p["k"], x), eps=EPS)
     q, k, v = (split_heads(by_tokens(y), heads) for y in (q, k, linear(p["v"], x)))
-    dtype = p["q"]["kernel"].dtype
+    dtype = products.dtype_of(p["q"]["kernel"])
     q, k, v = by_heads(rotate_pairs(q, angles), rotate_pairs(k, angles), v, dtype)
     y = merge_heads(attention(q, k, v, dtype=dtype, over="attention_heads"))
     return linear(p["o"], constrain(y, ("tokens", None)))
@@ -243,7 +248,7 @@ def self_attention(p: Tree, x: jax.Array, angles: jax.Array, *, heads: int) -> j
 
 def cross_attention(p: Tree, x: jax.Array, kv: Tree, *, heads: int) -> jax.Array:
     """Tokens [l, d] read text and image rows through two softmaxes with the same q, added before `o`."""
-    dtype = p["q"]["kernel"].dtype
+    dtype = products.dtype_of(p["q"]["kernel"])
     q = by_tokens(rms_norm(p["norm_q"], linear(p["q"], x), eps=EPS))
     q = split_heads(q, heads)
 
@@ -281,10 +286,15 @@ POLICIES: dict[Remat, Any] = {
 
 
 def rematerialise(f, remat: Remat):
-    """`f` as a scan body whose backward pass recomputes everything (full), all but what attention returns
-    (attention), all but products with weights and attention in pieces (dots), or nothing (none)."""
+    """f(x, rest) -> y as a loop's body whose backward pass recomputes everything (full), all but what attention returns
+    (attention), all but products with weights and attention in pieces (dots), or nothing (none).
+
+    `full` keeps x in bfloat16 where products are asked for in it.
+    """
     if remat == "none":
         return f
+    if remat == "full" and products.rounded(products.BF16):
+        return from_rounded(f)
     return checkpoint(f, policy=POLICIES[remat], prevent_cse=False)
 
 
@@ -306,17 +316,20 @@ def dit_blocks(
     assert (rows is None) or (kv is None), "context rows or their keys and values, not both"
     assert bool(cfg.text_len) == (rows is not None or kv is not None), "context iff text_len > 0"
 
-    def step(x, layer):
-        p, kv = layer
+    def one(x, rest):
+        (p, kv), (e0, angles, rows) = rest
         if rows is not None:
             kv = cross_kv(p, rows, cfg=cfg, split=split)
-        return constrain(block(p, x, e0, angles, kv, heads=cfg.heads), ("tokens", None)), None
+        return constrain(block(p, x, e0, angles, kv, heads=cfg.heads), ("tokens", None))
 
+    shared, step = (e0, angles, rows), rematerialise(one, remat)
     x = constrain(x, ("tokens", None))
-    x, _ = jax.lax.scan(rematerialise(step, remat), x, (p["blocks"], kv), unroll=unroll)
+    layers = p["blocks"], kv
+    x, _ = jax.lax.scan(lambda x, layer: (step(x, (layer, shared)), None), x, layers, unroll=unroll)
     return x
 
 
+@products.use(None)
 def head(p: Tree, x: jax.Array, e: jax.Array, *, grid: tuple[int, int, int], patch: int):
     """Tokens [l, d] of a (slots, rows, columns) grid -> velocity [t, lh, lw, c], modulated by e [d] (not e0)."""
     t, rows, columns = grid

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..config import VAEConfig
+from ..core import products
 from ..core.attention import attention
 from ..core.layers import convolve, lift, linear, linear_specs, norm_specs
 from ..core.params import Spec, Tree, fan_in, zeros
@@ -314,12 +315,14 @@ def encode_moments(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 
 
 @jax.named_scope("vae")
+@products.use(None)
 def encode(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """Video [t, h, w, 3] in [-1, 1] -> normalised latents [t', h/8, w/8, c] (the mean, no sampling)."""
     return normalise(encode_moments(p, video, cfg=cfg)[..., : cfg.latent], cfg=cfg)
 
 
 @jax.named_scope("vae")
+@products.use(None)
 def decode(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """Normalised latents [t', lh, lw, c] -> video [t, 8 lh, 8 lw, 3], not clamped to [-1, 1]."""
     return decode_raw(p, denormalise(latents, cfg=cfg), cfg=cfg)
@@ -346,6 +349,7 @@ def largest_map(shape: tuple[int, ...], cfg: VAEConfig) -> float:
 
 
 @jax.named_scope("vae")
+@products.use(None)
 def encode_chunked(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`encode` one latent frame at a time: the same latents in memory that does not grow with the clip."""
     if video.shape[0] == 1:
@@ -369,6 +373,7 @@ def encode_any(p: Tree, video: jax.Array, *, cfg: VAEConfig) -> jax.Array:
 
 
 @jax.named_scope("vae")
+@products.use(None)
 def decode_chunked(p: Tree, latents: jax.Array, *, cfg: VAEConfig) -> jax.Array:
     """`decode` one latent frame at a time."""
     if latents.shape[0] == 1:

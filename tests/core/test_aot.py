@@ -100,11 +100,11 @@ compiler = pytest.mark.skipif(
 )
 
 
-def compiled(*words) -> dict:
-    """A row of the experiment, made in a process of its own: this one has XLA's flags for quick tests."""
+def compiled(program: str, size: str, *sizes: int) -> dict:
+    """A row of the experiment for `paper` on H100, made in a process of its own: this one has XLA's flags for quick tests."""
     from experiments.scaling import compiled as experiment
 
-    return experiment.child(",".join(map(str, words)))
+    return experiment.child(experiment.Case("paper", size, program, "h100", sizes).name)
 
 
 @compiler
@@ -112,7 +112,7 @@ def test_the_14b_transformer_on_an_h100():
     """FLOPs, memory and kernels of one forward pass at the paper's first size, as its compiler has them."""
     cfg = config.preset("paper")
     d, tokens = cfg.dit, cost.tokens_per_slot(cfg) * cfg.slots(6)
-    row = compiled("velocity", "h100", 1, 1, 1)
+    row = compiled("velocity", "192x336", 1, 1, 1)
     assert not row["options"] and not row["unknown_loops"] and not row["collectives"]
     assert sum(row["flops"].values()) == pytest.approx(cost.velocity(d, tokens), rel=1e-3)
     assert row["flops"]["bf16"] > 0.999 * sum(row["flops"].values())
@@ -133,15 +133,16 @@ def test_the_14b_transformer_on_an_h100():
 @pytest.mark.parametrize("sizes", [(8, 1, 1), (2, 2, 2), (1, 1, 8)], ids=str)
 def test_a_step_on_eight_gpus(sizes):
     """The transformer of a LoRA step: the prompt is shared by all scenes. What is gathered is one block's at most."""
-    row = compiled("transformer step", "h100", *sizes)
+    row = compiled("transformer step", "192x336", *sizes)
     assert row["kernels"]["__cudnn$fmhaSoftmax"] and row["kernels"]["__cudnn$fmhaSoftmaxBackward"]
     assert not row["unknown_loops"]
     assert row["collectives"].keys() & {"all-reduce", "reduce-scatter"}
     assert row["largest_gather"] <= row["block"]
+    assert row["flops"].get("f32", 0.0) < 0.02 * sum(row["flops"].values()), "products"
 
 
 @compiler
 def test_small_products_compile_without_tiles():
     """The compiler's default tiles do not fit some: then Triton's products are left out."""
-    row = compiled("decode", "h100", 1, 1, 1)
+    row = compiled("decode", "192x336", 1, 1, 1)
     assert row["options"] == aot.NO_TRITON and row["temporary"] > 0

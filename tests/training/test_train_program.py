@@ -372,6 +372,7 @@ def test_every_setting_that_changes_what_is_trained_is_held(tmp_path):
         ("seed", {"seed": 1}),
         ("learning rate", {"stage": dataclasses.replace(stage, optim=faster)}),
         ("frozen dtype", {"frozen_dtype": "bfloat16"}),
+        ("dtype of products", {"stage": dataclasses.replace(stage, products="bfloat16")}),
         ("start contents", {"params": 1.0}),
         ("data contents", {"pool": None}),
         ("samples encoded once", {"stage": dataclasses.replace(stage, stored=7)}),
