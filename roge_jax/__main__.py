@@ -1,7 +1,7 @@
 """The programs, one line each: `python -m roge_jax`, or `roge` where the package is installed.
 
-    roge                           this list
-    roge sample --scene DIR        the same as python -m roge_jax.sample --scene DIR
+roge                           this list
+roge sample --scene DIR        the same as python -m roge_jax.sample --scene DIR
 """
 
 import ast

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..errors import UserError, did_you_mean
+from ..errors import OutputError, UserError, did_you_mean
 
 _PACKAGE = __package__.partition(".")[0]
 
@@ -96,9 +96,11 @@ def execute(
         except OSError as error:
             if error.errno is None:  # not the system's: a fault of the program
                 raise
-            return _report(_system(error), 2, debug)
+            return _report(UserError(system_sentence(error)), 2, debug)
         except MemoryError as error:
             return _report(UserError(f"Out of memory ({error}): {LESS}"), 1, debug)
+        except OutputError as error:
+            return _report(error, 1, debug)
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):  # XLA's words
                 first = str(error).splitlines()[0]
@@ -129,13 +131,11 @@ def _missing_platform() -> UserError | None:
     return None
 
 
-def _system(error: OSError) -> UserError:
-    """What the operating system refused, as a sentence: a full disk, a missing right, a name too long."""
+def system_sentence(error: OSError) -> str:
+    """What the operating system refused: a full disk, a missing right, a name too long."""
     name = str(error.filename or "The system")
     name = name if len(name) <= 200 else f"{name[:60]}...{name[-20:]}"
-    return UserError(
-        f"{name}: {error.strerror}: {REMEDIES.get(error.errno or 0, 'give another place')}."
-    )
+    return f"{name}: {error.strerror}: {REMEDIES.get(error.errno or 0, 'give another place')}."
 
 
 def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:

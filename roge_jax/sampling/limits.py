@@ -12,7 +12,7 @@ import functools
 import itertools
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -239,12 +239,18 @@ def entry(
 
 
 def warn(
-    images: np.ndarray, context: Cameras, target: Cameras, name: str, ids: Sequence[int]
+    images: np.ndarray,
+    context: Cameras,
+    target: Cameras,
+    name: str,
+    ids: Sequence[int],
+    known: Collection[str] = (),
 ) -> tuple[Beyond, ...]:
-    """`beyond` the measured limits of the model called `name`, each also a `LimitWarning`."""
+    """`beyond` the measured limits of the model called `name`, each also a `LimitWarning` unless its kind is `known`."""
     found = tuple(beyond(images, context, target, table(name), ids))
     for one in found:
-        warnings.warn(one.message, LimitWarning, stacklevel=3)
+        if one.kind not in known:
+            warnings.warn(one.message, LimitWarning, stacklevel=3)
     return found
 
 
