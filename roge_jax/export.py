@@ -227,7 +227,9 @@ def write_lora(tree, config, style: str, out: Path) -> None:
             "target_modules": names,
             "bias": "none",
         }
-        (part / "adapter_config.json").write_text(json.dumps(adapter, indent=1) + "\n")
+        (part / "adapter_config.json").write_text(
+            json.dumps(adapter, indent=1) + "\n", encoding="utf-8"
+        )
     put(part, out)
     left = sorted({p.partition("/")[0] for p in flatten(tree)} - {"dit"})
     full = any(p.startswith("dit/patch_embed") for p in flatten(tree))

@@ -262,7 +262,8 @@ def _processor() -> str:
     text = platform.machine() + platform.processor()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        text += "".join(re.findall(r"^(?:model name|flags)\s*:.*$", cpuinfo.read_text(), re.M)[:2])
+        said = cpuinfo.read_text(encoding="utf-8")
+        text += "".join(re.findall(r"^(?:model name|flags)\s*:.*$", said, re.M)[:2])
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
@@ -334,7 +335,9 @@ def peak_memory() -> dict[str, float]:
     if (
         status.exists()
     ):  # Linux; its ru_maxrss starts from that of the program that started this one
-        line = next(x for x in status.read_text().splitlines() if x.startswith("VmHWM"))
+        line = next(
+            x for x in status.read_text(encoding="utf-8").splitlines() if x.startswith("VmHWM")
+        )
         found["peak_memory_gb"] = int(line.split()[1]) * 1024 / 1e9
     else:
         with contextlib.suppress(ImportError):  # no such module on Windows
@@ -348,6 +351,11 @@ def peak_memory() -> dict[str, float]:
         if "peak_bytes_in_use" in stats:
             found["device_peak_memory_gb"] = stats["peak_bytes_in_use"] / 1e9
     return found
+
+
+def version() -> str:
+    """The package's own, of the code that runs, installed or not."""
+    return sys.modules[_PACKAGE].__version__
 
 
 def environment() -> dict[str, Any]:

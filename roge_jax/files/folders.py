@@ -243,7 +243,9 @@ def write_json(file: str | Path, content: Any) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
-        temporary.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+        temporary.write_text(
+            json.dumps(plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
         put(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)

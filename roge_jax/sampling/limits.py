@@ -146,7 +146,7 @@ def table(name: str) -> dict[str, Any]:
     """The measured limits of a model, {kind: {"limit": .., "broke": .., ..}}; empty if none were measured."""
     if not TABLE.exists():
         return {}
-    return json.loads(TABLE.read_text()).get(name, {}).get("limits", {})
+    return json.loads(TABLE.read_text(encoding="utf-8")).get(name, {}).get("limits", {})
 
 
 def beyond(

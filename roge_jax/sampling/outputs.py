@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .. import __version__
 from ..config import RoGeConfig, to_dict
 from ..files import video_io
-from ..files.entry import Clock, environment
+from ..files.entry import Clock, environment, version
 from ..files.folders import check_disk, plain, write_json
 from ..geometry.cameras import Cameras, concatenate
 from ..scenes import writers
@@ -31,14 +30,16 @@ ROOM = (
 )
 
 
-def remark(
-    config: dict[str, Any], settings: dict[str, Any], version: str | None = __version__
-) -> str:
+def remark(config: dict[str, Any], settings: dict[str, Any], release: str | None = None) -> str:
     """What every file that has a place for it says of its origin: version, seed and configuration, as one line of JSON.
 
     Arguments as in run.json.
     """
-    said = {"roge_jax": version, "model": config.get("name"), "seed": settings.get("seed")}
+    said = {
+        "roge_jax": release or version(),
+        "model": config.get("name"),
+        "seed": settings.get("seed"),
+    }
     return json.dumps(plain(said | {"config": config}), separators=(",", ":"))
 
 

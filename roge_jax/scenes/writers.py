@@ -87,7 +87,7 @@ def _nerfstudio(place: Path, poses: Poses) -> None:
     content = transforms(poses.names, poses.cameras, *poses.size, folder="")
     for entry in content["frames"]:
         entry["transform_matrix"] = entry["transform_matrix"].tolist()
-    place.write_text(json.dumps(content | {"fps": poses.fps}, indent=1))
+    place.write_text(json.dumps(content | {"fps": poses.fps}, indent=1), encoding="utf-8")
 
 
 def _re10k(place: Path, poses: Poses) -> None:
@@ -98,7 +98,7 @@ def _re10k(place: Path, poses: Poses) -> None:
         inner = [K[0, 0] / width, K[1, 1] / height, K[0, 2] / width, K[1, 2] / height, 0.0, 0.0]
         time = round(1e6 * i / poses.fps)
         lines.append(" ".join([str(time), *_digits([*inner, *w2c[:3].ravel()])]))
-    place.write_text("\n".join(lines) + "\n")
+    place.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _tum(place: Path, poses: Poses) -> None:

@@ -247,7 +247,7 @@ class Run:
 
 def about(folder: Path) -> str:
     """One line on a finished video, from its record."""
-    said = json.loads((folder / RECORD).read_text())
+    said = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     kind = "generated" if said["generated"] else "preview alone"
     seconds = said["stages"]["total"]["seconds"]
     height, width = said["size"]

@@ -175,7 +175,7 @@ def test_every_file_says_where_it_came_from(place):
     said = [json.loads(text) for text in said]
     said.append(json.loads((out / "transforms.json").read_text())["roge_jax"])
     for one in said:
-        assert one["roge_jax"] == sampling.outputs.__version__ and one["model"] == "tiny"
+        assert one["roge_jax"] == entry.version() and one["model"] == "tiny"
         assert one["config"]["dit"]["width"] == CONFIG.dit.width and "seed" in one
 
 
