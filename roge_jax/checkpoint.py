@@ -62,7 +62,7 @@ class Checkpoints:
             folder = self.folder / str(step)
             sync(folder)
             temporary = folder / f"{CHECKSUMS}.part"
-            temporary.write_text(json.dumps(_checksums(folder), indent=1) + "\n")
+            temporary.write_text(json.dumps(_checksums(folder), indent=1) + "\n", encoding="utf-8")
             put(temporary, folder / CHECKSUMS)
 
     def verify(self, step: int) -> None:
@@ -75,7 +75,7 @@ class Checkpoints:
         if not (folder / CHECKSUMS).exists():
             return
         try:
-            want = json.loads((folder / CHECKSUMS).read_text())
+            want = json.loads((folder / CHECKSUMS).read_text(encoding="utf-8"))
         except ValueError:
             want = {CHECKSUMS: ""}
         have = _checksums(folder)
@@ -153,7 +153,7 @@ def save_model(
                     piece = np.ascontiguousarray(piece, kinds[path][1])
                     file.write(piece.reshape(-1).view(np.uint8).data)
     record = {"format": 1, "config": to_dict(config), "provenance": provenance or {}}
-    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
+    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     put(temporary, folder)
 
 
@@ -363,8 +363,11 @@ def save_adapter(
         "config": to_dict(config),
         "provenance": provenance or {},
     }
-    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n")
-    (temporary / "README.md").write_text(adapter_card(leaves, config, provenance or {}))
+    (temporary / "config.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    card = adapter_card(
+        leaves, config, provenance or {}
+    )  # with names of files, which may be no text
+    (temporary / "README.md").write_text(card, encoding="utf-8", errors="backslashreplace")
     put(temporary, folder)
 
 

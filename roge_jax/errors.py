@@ -8,6 +8,10 @@ class UserError(ValueError):
     """A mistake in the input. Entry points print its one sentence and exit with code 2."""
 
 
+class OutputError(RuntimeError):
+    """What was computed could not be written whole. Its one sentence says what stays, where, and how to go on; exit code 1."""
+
+
 class LimitWarning(UserWarning):
     """Photos or a path lie beyond what the model was measured to stand (`limits`); the result may be poor."""
 

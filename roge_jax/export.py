@@ -1,12 +1,17 @@
-"""Export a trained adapter: `python -m roge_jax.export ADAPTER --merge BASE --out DIR` (or `--style`).
+"""What is made, for other programs: videos of a finished run, and trained adapters.
+
+    python -m roge_jax.export RUN --video gif,webm                       more kinds of video, from the frames that are there
+    python -m roge_jax.export ADAPTER --merge BASE --out DIR             a whole model
+    python -m roge_jax.export ADAPTER --style comfyui --out DIR          LoRA for another program
+
+RUN is a folder that `sample` wrote, also the frames that a failed run left. ADAPTER is a folder that `checkpoint.save_adapter`
+wrote; merging streams, so that memory stays at a few layers of the model.
 
     --merge BASE             a standalone model folder: the base with the LoRA merged and the new embeddings in place
     --style diffusers        the transformer's LoRA alone, under the names of diffusers' load_lora_adapter
     --style peft             ... with an adapter_config.json for peft around a diffusers transformer
     --style framecrafter     ... for FrameCrafter and DiffSynth-Studio
     --style comfyui          ... for ComfyUI
-
-ADAPTER is a folder that `checkpoint.save_adapter` wrote. Merging streams: memory stays at a few layers of the model.
 """
 
 import argparse
@@ -17,6 +22,7 @@ from pathlib import Path
 
 from .files.entry import number, one_of
 from .files.folders import put
+from .files.video_io import video_kinds
 
 STYLES = ("diffusers", "peft", "framecrafter", "comfyui")
 FILES = {
@@ -34,14 +40,19 @@ def parser() -> argparse.ArgumentParser:
         description=__doc__,
         formatter_class=argparse.RawTextHelpFormatter,
     )
-    p.add_argument("adapter", type=Path, help="adapter folder written by training")
-    p.add_argument("--merge", metavar="BASE", help="model folder or name to merge it into")
+    p.add_argument("folder", type=Path, help="folder that sample wrote, or adapter of training")
+    kinds = "of a run: write these kinds of video, with commas: mp4, webm, webp, gif"
+    p.add_argument("--video", type=video_kinds, metavar="KINDS", help=kinds)
+    fps = "with --video: frames per second (default: those of the run)"
+    p.add_argument("--fps", type=number(1e-3, 1000, whole=False), help=fps)
+    merge = "of an adapter: model folder or name to merge it into"
+    p.add_argument("--merge", metavar="BASE", help=merge)
     p.add_argument(
         "--style",
         type=one_of(STYLES),
-        help="names for other programs (the transformer's LoRA alone)",
+        help="of an adapter: names for other programs (the transformer's LoRA alone)",
     )
-    p.add_argument("--out", type=Path, required=True, help="new folder")
+    p.add_argument("--out", type=Path, help="of an adapter: new folder (default: required)")
     p.add_argument(
         "--shard-gb",
         type=number(1e-6, 1e6, whole=False),
@@ -53,24 +64,37 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(args: argparse.Namespace) -> None:
-    """Write the merged model or the LoRA in the style asked for."""
-    from .checkpoint import load_adapter
+    """Write what was asked for of a run or of an adapter."""
     from .errors import UserError
+
+    if sum(map(bool, (args.video, args.merge, args.style))) != 1:
+        raise UserError(
+            "Give one of --video for a finished run, --merge BASE for a whole model of an adapter, or --style for other "
+            "programs' LoRA files."
+        )
+    if args.video:
+        return export_run(args)
+    from .checkpoint import load_adapter
     from .weights.importer import check_output
 
-    if bool(args.merge) == bool(args.style):
-        raise UserError(
-            "Give either --merge BASE for a whole model, or --style for other programs' LoRA files."
-        )
+    if args.out is None:
+        raise UserError("No --out given: name the folder to write the adapter's export to.")
     check_output(args.out)
-    tree, config = load_adapter(args.adapter)
+    tree, config = load_adapter(args.folder)
     if args.merge:
-        merge_into(
-            args.merge, tree, config, args.adapter, args.out, shard_bytes=1e9 * args.shard_gb
-        )
+        merge_into(args.merge, tree, config, args.folder, args.out, shard_bytes=1e9 * args.shard_gb)
     else:
         write_lora(tree, config, args.style, args.out)
     print(f"{args.out}: written")
+
+
+def export_run(args: argparse.Namespace) -> None:
+    """More files into the folder of a run, made of its frames."""
+    from .sampling import finished
+
+    made = finished.read(args.folder)
+    for file in finished.write_videos(made, args.video, args.fps):
+        print(f"{file}: written, {len(made.names)} frames")
 
 
 def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes: float) -> None:
@@ -203,7 +227,9 @@ def write_lora(tree, config, style: str, out: Path) -> None:
             "target_modules": names,
             "bias": "none",
         }
-        (part / "adapter_config.json").write_text(json.dumps(adapter, indent=1) + "\n")
+        (part / "adapter_config.json").write_text(
+            json.dumps(adapter, indent=1) + "\n", encoding="utf-8"
+        )
     put(part, out)
     left = sorted({p.partition("/")[0] for p in flatten(tree)} - {"dit"})
     full = any(p.startswith("dit/patch_embed") for p in flatten(tree))

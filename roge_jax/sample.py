@@ -8,8 +8,9 @@
     python -m roge_jax.sample --scene DIR --preview-only           the reconstruction's own picture, nothing generated
     python -m roge_jax.sample --checkpoint paper --context 6 --dry-run     shapes, FLOPs, memory; no weights needed
 
-OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., transforms.json (the frames with
-their cameras, in the scene's frame and unit), contact_sheet.png and run.json. docs/start/first_video.md explains everything.
+OUT gets video.mp4, preview.mp4 (the reconstruction's own picture), frames/0000.png .., contact_sheet.png and run.json. It is
+also a scene of frames and photos, for nerfstudio and 3D Gaussian trainers: images/, transforms.json and sparse/0 (COLMAP).
+docs/start/first_video.md explains everything.
 A model that is a reconstruction alone, such as LagerNVS, makes its own picture; nothing is generated, and preview.mp4 is left out.
 """
 
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from .files.entry import Clock, number, one_of, run
-from .files.folders import output_folder, write_json
+from .files.folders import RECORD, output_folder, write_json
+from .files.video_io import video_kinds
 from .sampling.inputs import (
     ALONE,
     FPS,
@@ -104,6 +106,8 @@ def parser() -> argparse.ArgumentParser:
     option("--max-cost", "with or without --tolerance: the most FLOPs to spend", type=real)
     fps_help = f"frames per second; the path file's own, else {FPS:g}"
     option("--fps", fps_help, type=number(1e-3, 1000, whole=False))
+    video_help = "kinds of video, with commas: mp4, webm, webp, gif (default: mp4)"
+    p.add_argument("--video", default=("mp4",), type=video_kinds, metavar="KINDS", help=video_help)
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     mesh_help = "how to split the work over devices, e.g. fsdp=2,seq=2: weights; tokens and views (one device if not given)"
     option("--mesh", mesh_help)
@@ -130,10 +134,10 @@ def main(args: argparse.Namespace) -> None:
     import warnings
 
     from . import sampling
+    from .config import to_dict
     from .core import sharding, target
     from .errors import UserError
-    from .sampling import reconstruction
-    from .sampling.outputs import record, write_outputs
+    from .sampling import outputs, reconstruction
     from .sampling.scene_limits import Beside
 
     if args.trajectory == "list":
@@ -159,14 +163,14 @@ def main(args: argparse.Namespace) -> None:
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
     settings, only = settings.of(config), previews(args, config)
-    with output_folder(args.out) as folder, sharding.use(mesh):
+    with output_folder(args.out, keep=outputs.FRAMES) as folder, sharding.use(mesh):
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
+            size = config.output_size
+            kinds = outputs.check_outputs(folder, args.video, len(path), size, args.fps)
             params, _ = load_weights(args, mesh, reconstruction.PARTS if only else None)
         beside = Beside(scene, photos.ids, config, args.convention)
-        print(
-            f"{len(photos.ids)} photo{'s'[: len(photos.ids) != 1]} of {scene.source}, {len(path)} frames of {config.output_size[0]}x{config.output_size[1]}, {config.name}"
-        )
+        print(begun(args, scene, config, photos, path))
         plan = None
         if args.tolerance is not None or args.max_cost is not None:
             from .planning.plan import plan as make_plan
@@ -183,30 +187,33 @@ def main(args: argparse.Namespace) -> None:
                 )
             print(plan.explain())
         stage = beside.before_work(clock)
-        given = params, config, photos, path
+        given, more = (params, config, photos, path), {"stage": stage, "progress": True}
+        # The built-in scene has no third photo: that it has two is in run.json, and no mistake of the user's.
+        more["known"] = ("photos",) if args.scene == SCENE and len(photos.ids) == len(scene) else ()
         if only:
-            result = sampling.preview(*given, scale=args.scale, stage=stage, progress=True)
+            result = sampling.preview(*given, scale=args.scale, **more)
         else:
-            result = sampling.sample(*given, settings, plan=plan, stage=stage, progress=True)
+            result = sampling.sample(*given, settings, plan=plan, **more)
         result = dataclasses.replace(result, warnings=(*result.warnings, *beside.tell()))
         for note in result.normalisation.notes:
             warnings.warn(note, stacklevel=2)
-        with clock("write"):
-            write_outputs(folder, result, photos, args.fps, generated=not only)
         used = {"scale": args.scale} if only else dataclasses.asdict(settings)
-        content = record(
-            "roge_jax.sample",
-            vars(args),
-            config,
-            used,
-            scene,
-            photos,
-            result,
-            clock,
-            generated=not only,
-        )
-        content |= {} if plan is None else {"plan": dataclasses.asdict(plan)}
-        write_json(folder / "run.json", content)
+        made = config, used, scene, photos, result
+
+        def record() -> dict[str, Any]:
+            said = outputs.record("roge_jax.sample", vars(args), *made, clock, generated=not only)
+            return said | ({} if plan is None else {"plan": dataclasses.asdict(plan)})
+
+        with clock("write"):
+            write_json(folder / RECORD, record())  # also beside frames whose video fails
+            told: dict[str, Any] = {
+                "kinds": kinds,
+                "generated": not only,
+                "about": outputs.remark(to_dict(config), used),
+            }
+            outputs.write_outputs(folder, result, scene, photos, args.fps, **told)
+        content = record()
+        write_json(folder / RECORD, content)
     stages = ", ".join(
         f"{name} {stage['seconds']:.1f} s" for name, stage in content["stages"].items()
     )
@@ -215,8 +222,18 @@ def main(args: argparse.Namespace) -> None:
     )
     if only:
         print(f"{content['seconds_per_frame']:.3f} s a frame")
-    videos = "video.mp4, the preview" if only else "video.mp4, preview.mp4"
-    print(f"wrote {args.out}/ ({videos}, frames, transforms.json, contact_sheet.png, run.json)")
+    videos = [f"video.{kind}" for kind in kinds]
+    videos += ["the preview"] if only else [f"preview.{kind}" for kind in kinds]
+    rest = "frames, contact_sheet.png, run.json; images, transforms.json, sparse: as a scene"
+    print(f"wrote {args.out}/ ({', '.join(videos)}, {rest})")
+
+
+def begun(args: argparse.Namespace, scene, config, photos, path) -> str:
+    """The first line of a run: what of which scene."""
+    count, (height, width) = len(photos.ids), config.output_size
+    own = ", the built-in scene (--scene takes yours)" if args.scene == SCENE else ""
+    many = "photo" if count == 1 else "photos"
+    return f"{count} {many} of {scene.source}{own}, {len(path)} frames of {height}x{width}, {config.name}"
 
 
 def previews(args: argparse.Namespace, config) -> bool:

@@ -145,7 +145,7 @@ def test_former_names_are_found_with_a_warning():
 
 def test_the_plan_names_every_unit():
     """A new module has to be placed: below in the table, or among the programs and their helpers."""
-    units = {unit(path) for path in FILES} - {"__init__", "assets"}
+    units = {unit(path) for path in FILES} - {"__init__", "__main__", "assets"}
     assert units <= set(ALLOWED) | PROGRAMS
     assert set(ALLOWED) <= units
 
@@ -212,3 +212,23 @@ def test_modules_of_packages_are_there_without_importing_them():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def test_text_is_utf8_whatever_the_locale():
+    """A name with accents in a file that is written at the end of a run must not depend on LC_ALL."""
+    faults = []
+    for path in FILES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)):
+                continue
+            first = (
+                node.args[0].value if node.args and isinstance(node.args[0], ast.Constant) else ""
+            )
+            text = node.func.attr in ("read_text", "write_text") or (
+                node.func.attr == "open" and first in ("r", "w", "a", "x")
+            )
+            said = any(word.arg == "encoding" for word in node.keywords)
+            by_place = node.func.attr == "read_text" and node.args  # ours, of `files.fields`
+            if text and not said and not by_place:
+                faults.append(f"{path.relative_to(PACKAGE)}:{node.lineno}")
+    assert not faults, faults

@@ -14,7 +14,7 @@ DEVICE = "on each device, which has"  # ... of a device with memory of its own
 def memory_available() -> float | None:
     """Bytes that programs can still get on this machine; None where /proc does not tell."""
     try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
+        lines = Path("/proc/meminfo").read_text(encoding="utf-8").splitlines()
         return next(1024.0 * int(x.split()[1]) for x in lines if x.startswith("MemAvailable:"))
     except (OSError, StopIteration):
         return None

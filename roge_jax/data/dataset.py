@@ -116,7 +116,7 @@ def _sole_writer(path: Path) -> Iterator[None]:
 
     The system drops the lock when its process ends, however it ends.
     """
-    with (path / ".lock").open("w") as lock:
+    with (path / ".lock").open("w", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -136,7 +136,7 @@ def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int
             f"{k} {old.get(k)} (asked: {v})" for k, v in settings.items() if old.get(k) != v
         )
         raise UserError(f"{record} holds a dataset with {wrong}; write into another folder.")
-    record.write_text(json.dumps(settings, indent=1) + "\n")
+    record.write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")
     jobs = _missing(path, seeds, settings)
     # Threads lose on this work; one-thread processes scale. Workers read these when JAX starts.
     old = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}

@@ -130,7 +130,9 @@ def _pack_into(
         total += count
         found.append({"scene": str(spec), "views": len(scene), "sequences": count})
         print(f"{spec}: {len(scene)} views, {count} sequences", flush=True)
-    (out / "pool.json").write_text(json.dumps(size | {"scenes": found}, indent=1) + "\n")
+    (out / "pool.json").write_text(
+        json.dumps(size | {"scenes": found}, indent=1) + "\n", encoding="utf-8"
+    )
     return total
 
 

@@ -25,7 +25,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..errors import UserError, did_you_mean
+from ..errors import OutputError, UserError, did_you_mean
 
 _PACKAGE = __package__.partition(".")[0]
 
@@ -97,9 +97,11 @@ def execute(
         except OSError as error:
             if error.errno is None:  # not the system's: a fault of the program
                 raise
-            return _report(_system(error), 2, debug)
+            return _report(UserError(system_sentence(error)), 2, debug)
         except MemoryError as error:
             return _report(UserError(f"Out of memory ({error}): {LESS}"), 1, debug)
+        except OutputError as error:
+            return _report(error, 1, debug)
         except RuntimeError as error:
             if "RESOURCE_EXHAUSTED" in str(error) or "Out of memory" in str(error):  # XLA's words
                 first = str(error).splitlines()[0]
@@ -140,13 +142,11 @@ def _missing_platform() -> UserError | None:
     return None
 
 
-def _system(error: OSError) -> UserError:
-    """What the operating system refused, as a sentence: a full disk, a missing right, a name too long."""
+def system_sentence(error: OSError) -> str:
+    """What the operating system refused: a full disk, a missing right, a name too long."""
     name = str(error.filename or "The system")
     name = name if len(name) <= 200 else f"{name[:60]}...{name[-20:]}"
-    return UserError(
-        f"{name}: {error.strerror}: {REMEDIES.get(error.errno or 0, 'give another place')}."
-    )
+    return f"{name}: {error.strerror}: {REMEDIES.get(error.errno or 0, 'give another place')}."
 
 
 def parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
@@ -273,7 +273,8 @@ def _processor() -> str:
     text = platform.machine() + platform.processor()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        text += "".join(re.findall(r"^(?:model name|flags)\s*:.*$", cpuinfo.read_text(), re.M)[:2])
+        said = cpuinfo.read_text(encoding="utf-8")
+        text += "".join(re.findall(r"^(?:model name|flags)\s*:.*$", said, re.M)[:2])
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
@@ -345,7 +346,9 @@ def peak_memory() -> dict[str, float]:
     if (
         status.exists()
     ):  # Linux; its ru_maxrss starts from that of the program that started this one
-        line = next(x for x in status.read_text().splitlines() if x.startswith("VmHWM"))
+        line = next(
+            x for x in status.read_text(encoding="utf-8").splitlines() if x.startswith("VmHWM")
+        )
         found["peak_memory_gb"] = int(line.split()[1]) * 1024 / 1e9
     else:
         with contextlib.suppress(ImportError):  # no such module on Windows
@@ -359,6 +362,11 @@ def peak_memory() -> dict[str, float]:
         if "peak_bytes_in_use" in stats:
             found["device_peak_memory_gb"] = stats["peak_bytes_in_use"] / 1e9
     return found
+
+
+def version() -> str:
+    """The package's own, of the code that runs, installed or not."""
+    return sys.modules[_PACKAGE].__version__
 
 
 def environment() -> dict[str, Any]:

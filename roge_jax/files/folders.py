@@ -4,14 +4,17 @@ import contextlib
 import hashlib
 import json
 import os
+import shlex
 import shutil
+import warnings
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import OutputError, UserError
+from .entry import system_sentence
 from .fields import is_file, read_json
 
 RECORD = "run.json"  # what marks a folder as that of an earlier run
@@ -19,12 +22,13 @@ BLOCK_BYTES, BLOCKS = 65536, 16  # what `fingerprint` reads of a large array
 
 
 @contextlib.contextmanager
-def output_folder(out: str | Path) -> Iterator[Path]:
+def output_folder(out: str | Path, *, keep: str = "") -> Iterator[Path]:
     """A new folder to write into, renamed to `out` when the block ends and removed when it fails.
 
     A folder of an earlier run (it holds run.json) is replaced only then; any other folder that has files in it is
-    left alone. A link to a folder stays a link. Raises: UserError if `out` cannot be used or another run is writing
-    there, before anything is computed.
+    left alone. A link to a folder stays a link. keep: the sub-folder of frames: once there are any, a failure leaves all
+    that was written as OUT.unfinished. Raises: UserError if `out` cannot be used or another run is writing there, before
+    anything is computed; OutputError with how to go on where something was kept.
     """
     given, out = out, _resolved(Path(out))
     part = out.with_name(out.name + ".part")
@@ -34,6 +38,10 @@ def output_folder(out: str | Path) -> Iterator[Path]:
         if out.is_dir() and any(out.iterdir()) and not (out / RECORD).exists():
             raise UserError(
                 f"--out {given} has files that are not of an earlier run (no {RECORD}): give another folder."
+            )
+        if out.is_mount():
+            raise UserError(
+                f"--out {given} is where a disk is mounted, which cannot be replaced: give a folder in it, e.g. {Path(given) / 'video'}."
             )
         if part.exists():  # of a run that was killed, or is one still going?
             with held(part, given):
@@ -46,10 +54,43 @@ def output_folder(out: str | Path) -> Iterator[Path]:
     with held(part, given):
         try:
             yield part
-        except BaseException:
+            put(part, out)
+        except BaseException as error:
+            kept = _keep(part, out, keep) if keep else None
             shutil.rmtree(part, ignore_errors=True)
+            if kept is None:
+                raise
+            told = f"{_cause(error)} {kept}"
+            if isinstance(error, OSError | UserError | MemoryError):
+                raise OutputError(told) from error
+            warnings.warn(kept, stacklevel=3)  # a fault of the program, or an interruption
             raise
-        put(part, out)
+
+
+def _keep(part: Path, out: Path, frames: str) -> str | None:
+    """Move what a failed run has finished to a name of its own, and say where it is; None if there are no frames."""
+    finished = [part / frames, part / f"{frames}.part"]
+    place = next((one for one in finished if one.is_dir()), None)
+    count = 0 if place is None else sum(not file.name.startswith(".") for file in place.iterdir())
+    if place is None or not count:
+        return None
+    if place != finished[0]:
+        place.rename(finished[0])
+    free = (out.with_name(f"{out.name}.unfinished{i}") for i in ("", *range(2, 1000)))
+    kept = next(name for name in free if not name.exists())
+    part.rename(kept)
+    return (
+        f"{count} finished frame{'s are' if count > 1 else ' is'} in {kept / frames}: once that is mended, "
+        f"`python -m roge_jax.export {shlex.quote(str(kept))} --video mp4` makes the video of them."
+    )
+
+
+def _cause(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.errno is not None:
+        return system_sentence(error)
+    if isinstance(error, MemoryError):
+        return f"Out of memory ({error})."
+    return f"{str(error).rstrip('.')}."
 
 
 def put(temporary: Path, final: Path) -> None:
@@ -202,7 +243,9 @@ def write_json(file: str | Path, content: Any) -> None:
     file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
-        temporary.write_text(json.dumps(plain(content), indent=1, allow_nan=False) + "\n")
+        temporary.write_text(
+            json.dumps(plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
         put(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)

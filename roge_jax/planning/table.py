@@ -115,6 +115,6 @@ def load(name: str) -> Table:
         raise UserError(
             f"{FILE}: the planner's constants are missing: run python -m experiments.planning.ladder --calibrate."
         )
-    tables = json.loads(FILE.read_text())
+    tables = json.loads(FILE.read_text(encoding="utf-8"))
     name = name if name in tables else DEFAULT
     return parse(name, tables[name])

@@ -85,7 +85,7 @@ def solve(folder: Path, job: Job, progress: Progress) -> dict[str, Any]:
         _check_room(folder)
         said = _last_words(folder / "log.txt", code)
         raise UserError(f"pycolmap stopped ({said}): try fewer photos or a smaller --size.")
-    return json.loads((folder / "found.json").read_text())
+    return json.loads((folder / "found.json").read_text(encoding="utf-8"))
 
 
 def _follow(lines: "queue.Queue[str | None]", folder: Path, progress: Progress) -> None:
@@ -114,6 +114,7 @@ def _check_room(folder: Path) -> None:
 
 def _last_words(log: Path, code: int) -> str:
     """The last line of what native code or Python said, or how the process ended."""
-    said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    text = log.read_text(encoding="utf-8", errors="replace")
+    said = [line for line in text.splitlines() if line.strip()]
     plain = [line for line in said if not line.lstrip().startswith(("@", "***", "File", "PC:"))]
     return plain[-1].strip()[:200] if plain else f"exit code {code}"

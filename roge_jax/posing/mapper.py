@@ -144,7 +144,7 @@ class Work:
         pairing.match_list_path = self.folder / "pairs.txt"
         for batch in _batches(chosen, 8 * BATCH):
             lines = [f"{job.copy(i)} {job.copy(j)}\n" for i, j in batch]
-            Path(pairing.match_list_path).write_text("".join(lines))
+            Path(pairing.match_list_path).write_text("".join(lines), encoding="utf-8")
             colmap.match_image_pairs(self.database, options, pairing, geometry, colmap.Device.cpu)
             done += len(batch)
             say("matches", done, len(chosen))
@@ -270,7 +270,7 @@ def _drifted(work: Work, model: Any) -> bool:
 
 def run(folder: Path) -> None:
     """The whole job."""
-    work = Work(folder, Job(**json.loads((folder / "job.json").read_text())))
+    work = Work(folder, Job(**json.loads((folder / "job.json").read_text(encoding="utf-8"))))
     features = work.features()
     tried = work.match()
     geometries = work.verified()

@@ -12,7 +12,7 @@ import functools
 import itertools
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -146,7 +146,7 @@ def table(name: str) -> dict[str, Any]:
     """The measured limits of a model, {kind: {"limit": .., "broke": .., ..}}; empty if none were measured."""
     if not TABLE.exists():
         return {}
-    return json.loads(TABLE.read_text()).get(name, {}).get("limits", {})
+    return json.loads(TABLE.read_text(encoding="utf-8")).get(name, {}).get("limits", {})
 
 
 def beyond(
@@ -239,12 +239,18 @@ def entry(
 
 
 def warn(
-    images: np.ndarray, context: Cameras, target: Cameras, name: str, ids: Sequence[int]
+    images: np.ndarray,
+    context: Cameras,
+    target: Cameras,
+    name: str,
+    ids: Sequence[int],
+    known: Collection[str] = (),
 ) -> tuple[Beyond, ...]:
-    """`beyond` the measured limits of the model called `name`, each also a `LimitWarning`."""
+    """`beyond` the measured limits of the model called `name`, each also a `LimitWarning` unless its kind is `known`."""
     found = tuple(beyond(images, context, target, table(name), ids))
     for one in found:
-        warnings.warn(one.message, LimitWarning, stacklevel=3)
+        if one.kind not in known:
+            warnings.warn(one.message, LimitWarning, stacklevel=3)
     return found
 
 

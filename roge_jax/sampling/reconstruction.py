@@ -9,7 +9,7 @@ a generator; `roge_jax.viewer` asks for one camera at a time.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -181,24 +181,25 @@ def preview(
     stage: Stage | None = None,
     progress: bool | Bar = False,
     cache: dict[Any, Any] | None = None,
+    known: Collection[str] = (),
 ) -> Result:
     """The reconstruction's picture along `path`, as `frames` and `preview` of a result without evaluations.
 
-    As `sampling.sample`, whose windows all see the photos alone here. `scale`: as of `encode`. The scene is encoded once;
+    As `sampling.sample`, whose windows all see the photos alone here. `scale`: as of `encode`. `known`: as there. The scene is encoded once;
     its pictures come `at_once` and wait for no others.
     """
     from tqdm import tqdm
 
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
-    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
-    known, info = encode(params, config, photos, path, scale=scale, stage=stage, cache=cache)
+    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids, known)
+    encoded, info = encode(params, config, photos, path, scale=scale, stage=stage, cache=cache)
     targets = info.apply(path)
     length = at_once(config, len(path))
-    key = "look", length, _shapes(known)
+    key = "look", length, _shapes(encoded)
     if key not in cache:
         with stage("compile"):
-            cache[key] = compiled(params, known, length, config)
+            cache[key] = compiled(params, encoded, length, config)
     run, frames = cache[key], []
     bar: Any = progress
     if isinstance(progress, bool):
@@ -208,7 +209,7 @@ def preview(
         some = pad_path(targets[start:stop], length)
         K, c2w = (np.asarray(x, np.float32) for x in (some.K, some.c2w))
         with stage("preview"):
-            frames.append(np.array(run(params, known, K, c2w))[: stop - start])
+            frames.append(np.array(run(params, encoded, K, c2w))[: stop - start])
         bar.update(stop - start)
     bar.close()
     made = np.concatenate(frames)

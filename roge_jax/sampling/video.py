@@ -14,7 +14,7 @@ one length, to the RGB head: for both kinds of window that is one compilation mo
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any, NamedTuple
 
@@ -109,6 +109,7 @@ def sample(
     plan: Planned | None = None,
     progress: bool | Bar = False,
     cache: dict[Any, Any] | None = None,
+    known: Collection[str] = (),
 ) -> Result:
     """The video along `path` (cameras [n] in the scene's frame, K in pixels of config.height x config.width).
 
@@ -119,6 +120,7 @@ def sample(
       plan: what to leave out (`planning.plan`); its steps, solver and schedule replace those of `settings`.
       progress: show a bar over all evaluations of the velocity, or the bar to tell them to.
       cache: a dict that keeps the compiled programs for further calls with these parameters, config and slots.
+      known: kinds of `limits` that are no news to the user: they are in the result, and no warning is given.
     Raises: UserError for what cannot be done; `solvers.SamplingError` at the first number that is not finite.
     """
     stage = stage or (lambda name: nullcontext())
@@ -130,7 +132,7 @@ def sample(
         if plan is not None:
             raise UserError(NOTHING_TO_PLAN)
         show = functools.partial(
-            reconstruction.preview, stage=stage, progress=progress, cache=cache
+            reconstruction.preview, stage=stage, progress=progress, cache=cache, known=known
         )
         return show(params, config, photos, path, scale=settings.scale)
     given, unplanned, settings = len(photos.ids), config, settings.of(config)
@@ -149,7 +151,7 @@ def sample(
     context, target, info = normalise(
         photos.cameras, path, rule=config.scale_rule, scale=settings.scale
     )
-    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids)
+    warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids, known)
     grid = noise_levels(settings, config)
     runs = windows(len(path), config.frames)
     made, length = spans(plan, runs, config.frames)

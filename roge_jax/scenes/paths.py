@@ -87,7 +87,7 @@ def save_path(
     ]
     content: dict[str, Any] = {"convention": convention, "width": width, "height": height}
     content |= {"fps": fps} if fps else {}
-    Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1))
+    Path(file).write_text(json.dumps(content | {"frames": entries}, indent=1), encoding="utf-8")
 
 
 def load_path(
@@ -206,7 +206,7 @@ def save_keys(file: str | Path, keys: KeyFrames, height: int, width: int) -> Non
         entries = [entry | {"time": float(t)} for entry, t in zip(entries, keys.times, strict=True)]
     content: dict[str, Any] = {"convention": "opencv", "width": width, "height": height}
     content |= {k: v for k, v in (("fps", keys.fps), ("count", keys.count)) if v is not None}
-    Path(file).write_text(json.dumps(content | {"keyframes": entries}, indent=1))
+    Path(file).write_text(json.dumps(content | {"keyframes": entries}, indent=1), encoding="utf-8")
 
 
 def _as_written(

@@ -4,6 +4,7 @@ Names come from other machines: with backslashes, with folders that are not here
 another case of the ending. `Finder` finds what is meant, and nothing where more than one picture could be.
 """
 
+import contextlib
 import os
 import unicodedata
 from collections.abc import Iterable
@@ -149,7 +150,9 @@ class Finder:
 
 
 def _plain(text: str) -> str:
-    """A name without what differs between systems: composition of accents, case."""
+    """A name without what differs between systems: the locale's idea of its bytes, composition of accents, case."""
+    with contextlib.suppress(UnicodeError):  # UTF-8 on the disk, read in a locale that is not
+        text = os.fsencode(text).decode("utf-8")
     return unicodedata.normalize("NFC", text).casefold()
 
 

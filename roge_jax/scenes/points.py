@@ -33,11 +33,14 @@ PLY_TYPES = {
 
 @dataclasses.dataclass(frozen=True)
 class Points:
-    """xyz [p, 3] float64, rgb [p, 3] uint8 or None. seen: of every view the points that it sees, None if nobody knows."""
+    """xyz [p, 3] float64, rgb [p, 3] uint8 or None. seen: of every view the points that it sees, None if nobody knows;
+    pixels: of every view where it sees them [s, 2], edges at 0. error: mean distance in pixels of their images [p]."""
 
     xyz: np.ndarray
     rgb: np.ndarray | None = None
     seen: Sequence[np.ndarray] | None = None
+    pixels: Sequence[np.ndarray] | None = None
+    error: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -162,8 +165,8 @@ def read_ply(file: Path) -> Points:
     return Points(xyz, np.stack(colours, -1).astype(np.uint8) if len(colours) == 3 else None)
 
 
-def write_ply(file: Path, points: Points) -> None:
-    """Points with their colours, binary, as 3D Gaussian trainers and viewers read them."""
+def write_ply(file: Path, points: Points, *, about: str | None = None) -> None:
+    """Points with their colours, binary, as 3D Gaussian trainers and viewers read them. about: a remark in one line."""
     fields: list[tuple[str, str]] = [(c, "<f4") for c in "xyz"]
     fields += [(c, "u1") for c in ("red", "green", "blue")]
     table = np.zeros(len(points), fields)
@@ -171,6 +174,8 @@ def write_ply(file: Path, points: Points) -> None:
         table[axis] = points.xyz[:, i]
     for i, colour in enumerate(("red", "green", "blue")):
         table[colour] = 128 if points.rgb is None else points.rgb[:, i]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines = ["ply", "format binary_little_endian 1.0"]
+    lines += [f"comment {about.encode('ascii', 'backslashreplace').decode()}"] if about else []
+    lines += [f"element vertex {len(points)}"]
     lines += [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in fields]
     file.write_bytes(("\n".join([*lines, "end_header"]) + "\n").encode() + table.tobytes())

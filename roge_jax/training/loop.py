@@ -227,7 +227,7 @@ def train(
 
     log_file = log_path if is_main() else Path(os.devnull)
     with (
-        log_file.open("a") as log,
+        log_file.open("a", encoding="utf-8") as log,
         bar,
         contextlib.closing(checkpoints),
         source as ready,
@@ -338,7 +338,7 @@ def check_batch(batch: int, mesh: sharding.AnyMesh) -> None:
 
 def held_out_change(log: Path) -> str:
     """What a run's log says of the held-out loss, as the end of a sentence; empty without evaluations."""
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
+    rows = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
     found = [(row["step"], row["held_loss"]) for row in rows if row.get("held_loss") is not None]
     if len(found) < 2:
         return ""
@@ -407,10 +407,10 @@ def _cut_log(path: Path, step: int) -> None:
     if not path.exists():
         return
     kept = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(encoding="utf-8").splitlines():
         with contextlib.suppress(json.JSONDecodeError):
             if json.loads(line)["step"] <= step:
                 kept.append(line)
     temporary = path.with_suffix(".part")
-    temporary.write_text("".join(f"{line}\n" for line in kept))
+    temporary.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
     put(temporary, path)

@@ -257,7 +257,9 @@ def _graded(steps: int, power: float, sigma_min: float) -> np.ndarray:
 
 def optimised_grids(model: str) -> dict[str, dict[int, list[float]]]:
     """The stored grids of a model, {solver: {steps: sigmas [steps + 1]}}; empty if there are none."""
-    table = json.loads(OPTIMISED_FILE.read_text()) if OPTIMISED_FILE.exists() else {}
+    table = (
+        json.loads(OPTIMISED_FILE.read_text(encoding="utf-8")) if OPTIMISED_FILE.exists() else {}
+    )
     grids = table.get(model, {}).get("grids", {})
     return {solver: {int(n): g for n, g in some.items()} for solver, some in grids.items()}
 

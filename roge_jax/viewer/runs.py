@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from .. import sampling
-from ..config import RoGeConfig
+from ..config import RoGeConfig, to_dict
 from ..core.params import Tree
 from ..errors import UserError
 from ..files import video_io
 from ..files.entry import Clock
 from ..files.folders import RECORD, output_folder, write_json
 from ..geometry.cameras import Cameras
-from ..sampling.outputs import record, write_outputs
+from ..sampling import outputs
 from ..sampling.photos import Photos
 from ..sampling.windows import view_distance
 from ..scenes.scene import Scene, prepare
@@ -188,14 +188,20 @@ def make(
             yield
 
     place = next_folder(out, kind)
-    with output_folder(place) as folder:
+    with output_folder(place, keep=outputs.FRAMES) as folder:
+        outputs.check_outputs(folder, ("mp4",), len(order.path), config.output_size, order.fps)
+        used = dataclasses.asdict(settings) if order.generated else {"scale": settings.scale}
         if order.generated:
             more = {"stage": stage, "progress": progress, "cache": cache}
             result = sampling.sample(*given, settings, **more)
         else:
             result = sampling.preview(*given, scale=settings.scale, stage=stage)
         with stage("write"):
-            write_outputs(folder, result, photos, order.fps, generated=order.generated)
+            told: dict[str, Any] = {
+                "generated": order.generated,
+                "about": outputs.remark(to_dict(config), used),
+            }
+            outputs.write_outputs(folder, result, scene, photos, order.fps, **told)
             pictures, _ = prepare(scene, photos.ids, *config.output_size, drop_duplicates=False)
             shown = [pictures[nearest_photos(photos.cameras, order.path)], result.preview]
             shown += [result.frames] if order.generated else []
@@ -204,8 +210,7 @@ def make(
             video_io.write_video(folder / BESIDE, side_by_side(*shown), order.fps)
             order.write_path(folder / PATH)
         asked = {"fps": order.fps, "frames": len(order.path)}
-        used = dataclasses.asdict(settings) if order.generated else {"scale": settings.scale}
-        said = record(
+        said = outputs.record(
             "roge_jax.view", asked, config, used, scene, photos, result, clock,
             generated=order.generated,
         )  # fmt: skip
@@ -242,7 +247,7 @@ class Run:
 
 def about(folder: Path) -> str:
     """One line on a finished video, from its record."""
-    said = json.loads((folder / RECORD).read_text())
+    said = json.loads((folder / RECORD).read_text(encoding="utf-8"))
     kind = "generated" if said["generated"] else "preview alone"
     seconds = said["stages"]["total"]["seconds"]
     height, width = said["size"]

@@ -229,14 +229,14 @@ def write(
     check_disk(sum(layout.sizes), part, held=[part])
     part.mkdir(parents=True, exist_ok=True)
     if not done:
-        (part / PLAN).write_text(json.dumps(record))
+        (part / PLAN).write_text(json.dumps(record), encoding="utf-8")
     try:
         _write_pieces(plan, part, layout, done, progress)
     except UserError:
         shutil.rmtree(part, ignore_errors=True)
         raise
     config = {"format": 1, "config": to_dict(plan.config), "provenance": plan.provenance}
-    (part / "config.json").write_text(json.dumps(config, indent=1) + "\n")
+    (part / "config.json").write_text(json.dumps(config, indent=1) + "\n", encoding="utf-8")
     (part / PLAN).unlink()
     (part / PROGRESS).unlink(missing_ok=True)
     put(part, out)
@@ -289,7 +289,7 @@ def _note(part: Path, shards: Shards, pieces: int) -> None:
     """Remember that so many pieces are on the disk."""
     shards.flush()
     new = part / f"{PROGRESS}.new"
-    new.write_text(str(pieces))
+    new.write_text(str(pieces), encoding="utf-8")
     new.replace(part / PROGRESS)
 
 
@@ -314,8 +314,8 @@ def _record(plan: Plan, layout: Layout) -> dict:
 def _resumable(part: Path, record: dict) -> int:
     """How many pieces an earlier run with the same record has finished."""
     try:
-        before = json.loads((part / PLAN).read_text())
-        done = int((part / PROGRESS).read_text())
+        before = json.loads((part / PLAN).read_text(encoding="utf-8"))
+        done = int((part / PROGRESS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return 0
     changed = [name for name in record if before.get(name) != record[name]]

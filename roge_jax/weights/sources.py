@@ -198,7 +198,7 @@ def _shards(folder: Path, files: list[Path], count: int) -> dict[str, Stored]:
 
 def _indexed(index: Path) -> dict[str, Stored]:
     try:
-        files: dict[str, str] = json.loads(index.read_text())["weight_map"]
+        files: dict[str, str] = json.loads(index.read_text(encoding="utf-8"))["weight_map"]
         names = sorted(set(files.values()))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(

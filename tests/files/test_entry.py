@@ -193,7 +193,9 @@ class TestCache:
             for cores in (1, 2):  # of any number and speed at the moment
                 core = f"processor\t: 0\nmodel name\t: {name}\ncpu MHz\t: {cores}\nflags\t\t: {flags}\n"
                 monkeypatch.setattr(entry.Path, "exists", lambda file: True)
-                monkeypatch.setattr(entry.Path, "read_text", lambda file, said=cores * core: said)
+                monkeypatch.setattr(
+                    entry.Path, "read_text", lambda file, encoding, said=cores * core: said
+                )
                 folders.add(entry.cache_folder())
         assert len(folders) == 3
 

@@ -80,8 +80,10 @@ def test_all_files_are_there_and_no_other(chain):
     assert names == [
         "contact_sheet.png",
         "frames",
+        "images",
         "preview.mp4",
         "run.json",
+        "sparse",
         "transforms.json",
         "video.mp4",
     ]
@@ -108,12 +110,13 @@ def test_videos_and_frames_agree(chain):
 
 def test_transforms_are_the_path_in_the_scenes_own_frame(chain, place):
     made = load_scene(chain)
-    assert len(made) == 12 and made.sizes == [(CONFIG.height, CONFIG.width)] * 12
+    assert len(made) == 12 + 4 and set(made.sizes) == {(CONFIG.height, CONFIG.width)}
     scene = load_scene(place / "scene")
     photos = sampling.read_photos(scene, [0, 1, 2, 3], CONFIG)
     path = make_path("orbit", photos.cameras, 12, degrees=30)
-    np.testing.assert_allclose(made.cameras.c2w, path.c2w, atol=1e-12)
-    np.testing.assert_allclose(made.cameras.K, path.K, atol=1e-10)
+    np.testing.assert_allclose(made.cameras.c2w[:12], path.c2w, atol=1e-12)
+    np.testing.assert_allclose(made.cameras.K[:12], path.K, atol=1e-10)
+    np.testing.assert_allclose(made.cameras.c2w[12:], photos.cameras.c2w, atol=1e-12)
 
 
 def test_record_says_what_was_made(chain, place):

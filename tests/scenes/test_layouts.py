@@ -1,6 +1,9 @@
 """Every layout, once as a scene and once as a path: one ground truth, the same cameras, every omission told."""
 
 import json
+import os
+import subprocess
+import sys
 import warnings
 from pathlib import Path
 
@@ -279,6 +282,21 @@ def test_names_of_other_machines_are_found(tmp_path, how):
         f"{i:04d}.png" for i in range(4)
     ]
     np.testing.assert_allclose(scene.images[2] * 255, picture(2), atol=1e-4)
+
+
+def test_accents_are_found_in_a_locale_that_has_none(tmp_path):
+    """There Python shows the names on the disk with the bytes of their accents, a file's own with the accents."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "é 0.png").touch()
+    code = (
+        "import sys; from pathlib import Path; from roge_jax.scenes.pictures import Finder;"
+        "found = Finder(Path(sys.argv[1])).find('images/\\xe9 0.png');"
+        "assert sys.getfilesystemencoding() == 'ascii' and found is not None and found.is_file()"
+    )
+    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    call = [sys.executable, "-c", code, str(tmp_path)]
+    done = subprocess.run(call, env=os.environ | ascii_only, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("forms", [("NFC", "NFD"), ("NFD", "NFC")])

@@ -63,6 +63,13 @@ def from_content(content: Any, file: Path, *, convention: str | None, photos: bo
         raise UserError(f"{file}: has no frames: 'frames' must be a list with one entry per photo.")
     more = content.get("test_frames")
     listed = listed + more if isinstance(more, list) else listed
+    ours = content.get("roge_jax")
+    if not photos and isinstance(ours, dict):  # a video's own: the photos follow its frames
+        listed = listed[
+            : number(
+                ours.get("path_frames", len(listed)), str(file), "path_frames", low=1, whole=True
+            )
+        ]
     axes = content.get("convention") or convention or "opengl"
     check_convention(axes, file)
     reading = Reading(file, [], axes=axes, fps=rate(content, file))
