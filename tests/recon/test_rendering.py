@@ -193,7 +193,7 @@ def test_where_no_photo_sees_anything_the_mixture_stays():
         height=2 * H,
         width=2 * W,
     )
-    np.testing.assert_allclose(np.asarray(shown), 0.25, atol=1e-6)  # 0.5 + 0.5 (0 - 0.5)
+    np.testing.assert_allclose(np.asarray(shown), 0.5, atol=1e-6)  # no black: nothing is taken
 
 
 def test_photos_that_disagree_leave_the_picture_to_the_mixture():
