@@ -77,8 +77,8 @@ class About(NamedTuple):
     @classmethod
     def of(cls, cut: jax.Array, cuts: int, reach: jax.Array, size: tuple[int, int]) -> "About":
         """About coarse cuts [., .] of `cuts` that divide `reach` of the axis, at a finer `size` (height, width)."""
-        ends = (inverse_depth(cut + beyond, cuts, reach) for beyond in (-BEYOND, BEYOND))
-        low, high = envelope(*ends, *size)
+        far, near = (inverse_depth(cut + beyond, cuts, reach) for beyond in (-BEYOND, BEYOND))
+        low, high = envelope(far, near, *size)
         labels = jnp.linspace(0.0, 1.0, LABELS)[:, None, None]
         inverse = low[None] + (high - low)[None] * labels
         away = cut_at(inverse, cuts, reach) - jax.image.resize(cut, size, "linear")[None]

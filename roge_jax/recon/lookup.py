@@ -158,7 +158,7 @@ def look_up(
 
     alike = twins(photo_cameras[1])
     if full is not None:
-        size = photos.shape[1:3]
+        size = (photos.shape[1], photos.shape[2])
         photo_depths = depths(p.get("match"), full.photos, *photo_cameras, size=size, cuts=cuts)
         wide = full.photos.shrunk()
         colours = Texels.of(wide.rgb)
@@ -202,8 +202,8 @@ def look_up(
     if full is None:
         return looked
     scale = photo_cameras[0][None, :, 0, 0] / cameras[0][:, None, 0, 0]
-    size = {"height": full.height, "width": full.width}
-    return looked._replace(full=render(full.photos, way, blend, scale, **size))
+    wanted = {"height": full.height, "width": full.width}
+    return looked._replace(full=render(full.photos, way, blend, scale, **wanted))
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:

@@ -74,7 +74,8 @@ class Photos(NamedTuple):
     def pixels(self, i: Array) -> Array:
         """Centres [h w, 2] = (x, y) of the pixels of one, in pixels of the model's size."""
         scale, offset = self.window(i)
-        return (pixels_of(*self.rgb.shape[1:3], 1) - offset[None, ::-1]) / scale[None, ::-1]
+        h, w = self.rgb.shape[1:3]
+        return (pixels_of(h, w, 1) - offset[None, ::-1]) / scale[None, ::-1]
 
 
 class Blend(NamedTuple):
