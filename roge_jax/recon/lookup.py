@@ -187,13 +187,16 @@ def look_up(
             return own, None
         h, w = size
         inverse, step = surfaces(photo_depths, way, belief, reach, size)
-        near = inverse[FINER // 2 :: FINER, FINER // 2 :: FINER].reshape(-1)
+        where = pixels_of(FINER * h, FINER * w, 1.0 / FINER)
+        clear = 1.0 - blocked(photo_depths, way, where, inverse.reshape(-1))
+        clear = clear.reshape(-1, FINER * h, FINER * w, 1)
+        near = inverse[FINER // 2 :: FINER, FINER // 2 :: FINER]
         where = pixels_of(h, w, 1)
-        values, seen = fetch(colours, wide.into(way), where, near[None], wide.frames)
-        seen = seen * (1.0 - blocked(photo_depths, way, where, near))[:, None]
+        values, seen = fetch(colours, wide.into(way), where, near.reshape(1, -1), wide.frames)
         found, seen = values.reshape(-1, h, w, 3), seen.reshape(-1, h, w, 1)
-        _, share, (_, gate, rest) = choose(cut_at(near.reshape(h, w), cuts, reach), found, seen)
-        return own, Blend(inverse, step, share, gate, head, rest)
+        seen = seen * clear[:, FINER // 2 :: FINER, FINER // 2 :: FINER]
+        _, share, (_, gate, rest) = choose(cut_at(near, cuts, reach), found, seen)
+        return own, Blend(inverse, step, share, clear, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.

@@ -16,6 +16,7 @@ from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, summed
 Array = Any  # of JAX, or of NumPy before a program takes it
 LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
 DISAGREED = 0.05  # difference of the photos' colours at which half of the picture is not theirs
+CHOICE = 2.0  # exponent of the photos' shares: means of many photos are blurred
 FADE = 0.1  # weight of all photos below which they fade out
 
 
@@ -84,6 +85,9 @@ class Blend(NamedTuple):
     inverse: jax.Array  # [v, ., .] inverse depth, at the model's size or larger
     step: jax.Array  # [v] between the inverse depths that were compared
     share: jax.Array  # [v, m, h, w, 1] of each photo
+    clear: (
+        jax.Array
+    )  # [v, m, ., ., 1] how much of each photo nothing in front hides, of the depths' size
     gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
     head: jax.Array  # [v, h, w, 3] the RGB head's picture
     rest: jax.Array  # [v, h, w, 3] what the mixture adds to both
@@ -174,7 +178,9 @@ def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, h
     m = len(colours)
     colours, seen = colours.reshape(m, height, width, 3), seen.reshape(m, height, width, 1)
 
-    share = _resized(blend.share, height, width) * seen
+    share = jnp.maximum(_resized(blend.share, height, width), 0.0) ** CHOICE
+    share = share / jnp.maximum(summed(share), EPS)[None]
+    share = share * _resized(blend.clear, height, width) * seen
     weight = summed(share)
     photos = summed(share * colours) / jnp.maximum(weight, EPS)  # [height, width, 3]
     head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
