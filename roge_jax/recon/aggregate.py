@@ -14,6 +14,7 @@ BELIEF = 1.0  # weight of the network's logarithmic probability beside the evide
 LEAST = -12.0  # it is not taken for less
 HIDDEN = 20.0  # further cost of cuts that no photo sees
 STEP, JUMP = 1.2, 10.0  # cost of a neighbour one cut, and more than one cut, away
+EDGE = 0.06  # difference of neighbours' colours at which a jump costs half
 AROUND = 2  # pixels: a finer level looks between the coarse answers of these
 TAIL, MARGIN = 0.02, 1.2  # of inverse depths: left out at either end, and added again
 TOGETHER = 1.5  # cuts by which neighbours on one surface differ at most
@@ -38,26 +39,39 @@ def box(x: jax.Array, radius: int) -> jax.Array:
     return x
 
 
-def semi_global(cost: jax.Array) -> jax.Array:
-    """Costs [k, h, w] of cuts with those of the neighbours along both axes, both ways."""
+def semi_global(cost: jax.Array, guide: jax.Array | None = None) -> jax.Array:
+    """Costs [k, h, w] of cuts with those of the neighbours along both axes, both ways.
 
-    def along(cost: jax.Array, reverse: bool) -> jax.Array:
-        def step(before, own):
+    guide: [h, w, 3] the picture that they are of; where its colours change, cuts may jump for less.
+    """
+
+    def along(cost: jax.Array, jump: jax.Array, reverse: bool) -> jax.Array:
+        def step(before, given):
+            own, jump = given
             least = before.min(0, keepdims=True)
             far = jnp.full_like(least, 1e9)
             near = jnp.minimum(
                 jnp.concatenate([before[1:], far]), jnp.concatenate([far, before[:-1]])
             )
-            total = own + jnp.minimum(jnp.minimum(before, near + STEP), least + JUMP) - least
+            total = own + jnp.minimum(jnp.minimum(before, near + STEP), least + jump[None]) - least
             return total, total
 
-        rows = jnp.moveaxis(cost, -1, 0)
-        _, total = jax.lax.scan(step, jnp.zeros_like(rows[0]), rows, reverse=reverse)
+        rows = jnp.moveaxis(cost, -1, 0), jump.T
+        _, total = jax.lax.scan(step, jnp.zeros_like(rows[0][0]), rows, reverse=reverse)
         return jnp.moveaxis(total, 0, -1)
 
-    turned = jnp.swapaxes(cost, 1, 2)
-    down = along(turned, False) + along(turned, True)
-    return (along(cost, False) + along(cost, True) + jnp.swapaxes(down, 1, 2)) / 4
+    def both_ways(cost: jax.Array, guide: jax.Array | None) -> jax.Array:
+        jump = jnp.full(cost.shape[1:], JUMP)
+        first = last = jump
+        if guide is not None:
+            apart = jnp.abs(guide[:, 1:] - guide[:, :-1]).mean(-1)
+            cheaper = jnp.maximum(JUMP / (1.0 + apart / EDGE), STEP)
+            first, last = jump.at[:, 1:].set(cheaper), jump.at[:, :-1].set(cheaper)
+        return along(cost, first, False) + along(cost, last, True)
+
+    turned = None if guide is None else jnp.swapaxes(guide, 0, 1)
+    down = both_ways(jnp.swapaxes(cost, 1, 2), turned)
+    return (both_ways(cost, guide) + jnp.swapaxes(down, 1, 2)) / 4
 
 
 def cheapest(cost: jax.Array) -> jax.Array:

@@ -3,8 +3,8 @@
 Not in the paper (`RendererConfig.lookup`, on in `mini`): a renderer trained for hours instead of weeks puts things where
 they belong but blurs them, and what it lost is in the photos. As in plane sweeping (Collins 1996; Yao et al. 2018,
 "MVSNet") a ray is cut at many inverse depths, but nothing here is told what depth is right: the distribution over the cuts
-is an attention, learned from the photometric term alone. A picture larger than the model (`full`) asks all rays of a view
-together (`recon.depth`), with features that did learn from depth.
+is an attention, learned from the photometric term alone. A picture larger than the model (`full`) asks the photos' own
+depths (`recon.surfaces`), found with features that did learn from depth.
 
 1. Coarse, per cell of 4 x 4 pixels: at each of `RendererConfig.lookup` cuts, how well do features of the photos agree
    where the cut projects to, and how well do their colours agree there, in the region and in the whole view? Together
@@ -33,13 +33,16 @@ from ..core.layers import (
 from ..core.params import Spec, Tree, fan_in, stack, zeros
 from ..core.sharding import ways
 from ..core.stepping import checkpoint
-from .depth import FINER, levels_of, surfaces
+from .depth import FINER, depths
 from .matching import matching_specs
 from .rendering import Blend, Photos, render
+from .surfaces import blocked, surfaces
 from .sweep import (
+    CELL,
     EPS,
     SHARED,
     Motion,
+    Texels,
     agreement,
     all_cuts,
     cut_at,
@@ -54,7 +57,6 @@ from .sweep import (
     witnesses,
 )
 
-CELL = 4  # pixels, along both axes
 BLOCKS, WIDTH, MATCHED = 3, 16, 8  # coarse network; channels of the photos' features
 FINE = 8  # cuts of the fine level, a quarter of a coarse interval apart
 ALONG = 5  # neighbouring cuts that a coarse block sees
@@ -157,8 +159,11 @@ def look_up(
     prior, context = tokens[..., :cuts], tokens[..., cuts:]
 
     alike = twins(photo_cameras[1])
-    match = p.get("match")
-    levels = None if full is None else levels_of(match, full.photos)
+    if full is not None:
+        size = (photos.shape[1], photos.shape[2])
+        photo_depths = depths(p.get("match"), full.photos, *photo_cameras, size=size, cuts=cuts)
+        wide = full.photos.shrunk()
+        colours = Texels.of(wide.rgb)
 
     @checkpoint
     def one(way, prior, context, head, far):
@@ -180,18 +185,20 @@ def look_up(
         found, seen, cut = _fine(p["fine"], photos, alike, cuts, way, reach, cut, head)
         looked, _, (mixed, _, _) = choose(cut, found, seen)
         own = Looked(mixed, head, looked, coarse)
-        if levels is None:
+        if full is None:
             return own, None
-        h, w = photos.shape[1:3]
-        inverse, step = surfaces(match, levels, way, belief, reach, alike, (h, w))
+        h, w = size
+        inverse, step = surfaces(photo_depths, way, belief, reach, size)
+        where = pixels_of(FINER * h, FINER * w, 1.0 / FINER)
+        clear = 1.0 - blocked(photo_depths, way, where, inverse.reshape(-1))
+        clear = clear.reshape(-1, FINER * h, FINER * w, 1)
         near = inverse[FINER // 2 :: FINER, FINER // 2 :: FINER]
-        wide = levels[0].photos
-        size = (wide.size[:, 0], wide.size[:, 1])
-        colours = levels[0].described.plain, wide.into(way)
-        values, seen = fetch(*colours, pixels_of(h, w, 1), near.reshape(1, -1), size)
-        found, seen = values[..., :3].reshape(-1, h, w, 3), seen.reshape(-1, h, w, 1)
+        where = pixels_of(h, w, 1)
+        values, seen = fetch(colours, wide.into(way), where, near.reshape(1, -1), wide.frames)
+        found, seen = values.reshape(-1, h, w, 3), seen.reshape(-1, h, w, 1)
+        seen = seen * clear[:, FINER // 2 :: FINER, FINER // 2 :: FINER]
         _, share, (_, gate, rest) = choose(cut_at(near, cuts, reach), found, seen)
-        return own, Blend(inverse, step, share, gate, head, rest)
+        return own, Blend(inverse, step, share, clear, gate, head, rest)
 
     views = way, prior, context, head, _distances(cameras[1], photo_cameras[1])
     # Of a lone CPU's caches and memory one view at a time makes the most.
@@ -200,8 +207,8 @@ def look_up(
     if full is None:
         return looked
     scale = photo_cameras[0][None, :, 0, 0] / cameras[0][:, None, 0, 0]
-    size = {"height": full.height, "width": full.width}
-    return looked._replace(full=render(full.photos, way, blend, scale, **size))
+    wanted = {"height": full.height, "width": full.width}
+    return looked._replace(full=render(full.photos, way, blend, scale, **wanted))
 
 
 def _features(p: Tree, photos: jax.Array) -> jax.Array:

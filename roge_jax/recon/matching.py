@@ -1,8 +1,8 @@
-"""How alike photos are where a cut projects to: learned matching features beside colour and normalised luma.
+"""How alike a photo and others are where a cut projects to: learned features beside colour and normalised luma.
 
 As in MC-CNN (Zbontar & LeCun 2016) a small network describes every pixel by unit vectors, near and wide, and two photos
 show the same point if theirs point the same way. It is trained on rendered scenes with their depth (`training.matching`)
-and compares photos only: what a view's depth is follows from the aggregation (`recon.aggregate`).
+and compares photos only: what a photo's depth is follows from the aggregation (`recon.depth`).
 """
 
 from typing import NamedTuple
@@ -16,11 +16,9 @@ from .aggregate import with_structure
 from .sweep import Motion, Size, Texels, fetch, meet, nearest
 
 HIDDEN, VECTOR = 16, 8  # channels of the layers, and of each of the two descriptions of a pixel
-STRANGE = -4.0  # evidence for a cut that no two photos see, in units of a logit
-COLOUR, MOST = (
-    10.0,
-    2.0,
-)  # scale of a difference of colours; differences of structure above this count no more
+STRANGE = -4.0  # evidence for a cut that no other photo sees, in units of a logit
+COLOUR = 10.0  # scale of a difference of colours
+MOST = 2.0  # differences of structure above this count no more
 VECTORS = 4.0  # what full agreement of two vectors weighs before training
 
 
@@ -35,7 +33,7 @@ def matching_specs() -> Tree:
     wide = (("conv1", HIDDEN, HIDDEN), ("conv2", HIDDEN, HIDDEN), ("conv3", HIDDEN, VECTOR))
     weights = Spec(
         (5,), (None,), ones
-    )  # near, wide, colour, structure, sharpness of the choice between pairs
+    )  # near, wide, colour, structure, sharpness of the choice between photos
     return {
         "near": {name: conv2d_specs(a, b, 3) for name, a, b in near},
         "wide": {name: conv2d_specs(a, b, 3) for name, a, b in wide},
@@ -47,12 +45,17 @@ class Described(NamedTuple):
     """Photos of one size as they are compared, ready to be read from."""
 
     plain: Texels  # colour and structure, read between pixels
-    vectors: (
-        jax.Array | None
-    )  # [m h w, 2 VECTOR] unit vectors, read at the nearest pixel; None: not learned
+    vectors: jax.Array | None  # [m h w, 2 VECTOR] read at the nearest pixel; None: not learned
+
+    @classmethod
+    def of(cls, descriptions: jax.Array) -> "Described":
+        """Of `descriptions` [m, h, w, c]."""
+        vectors = descriptions[..., :-4]
+        rows = vectors.reshape(-1, 2 * VECTOR) if vectors.shape[-1] else None
+        return cls(Texels.of(descriptions[..., -4:]), rows)
 
     def at(self, way: Motion, pixels: jax.Array, inverse: jax.Array, size: Size):
-        """Values [m, k, p, 2 VECTOR + 4] where one view's rays meet their cuts, and whether they are seen (`sweep.fetch`)."""
+        """Descriptions [m, k, p, c] where one view's rays meet their cuts, and whether they are seen (`sweep.fetch`)."""
         values, seen = fetch(self.plain, way, pixels, inverse, size)
         if self.vectors is None:
             return values, seen
@@ -61,17 +64,12 @@ class Described(NamedTuple):
         first = self.plain.number[:, None, None] * (h * w)
         return jnp.concatenate([nearest(self.vectors, x, y, (h, w), first), values], -1), seen
 
-    def among(self, kept: jax.Array) -> "Described":
-        """Some of the photos [k]."""
-        return self._replace(plain=self.plain._replace(number=self.plain.number[kept]))
 
-
-def described(p: Tree | None, photos: jax.Array) -> Described:
-    """Photos [m, h, w, 3] in [0, 1] as they are compared. Without leaves (None) by colour and structure alone."""
+def descriptions(p: Tree | None, photos: jax.Array) -> jax.Array:
+    """What pixels of photos [m, h, w, 3] in [0, 1] are compared by [m, h, w, 2 VECTOR + 4]: two unit vectors, colour and
+    structure. Without leaves (None) the latter two alone."""
     photos = with_structure(photos)
-    if p is None:
-        return Described(Texels.of(photos), None)
-    return Described(Texels.of(photos), vectors(p, photos).reshape(-1, 2 * VECTOR))
+    return photos if p is None else jnp.concatenate([vectors(p, photos), photos], -1)
 
 
 def vectors(p: Tree, photos: jax.Array) -> jax.Array:
@@ -93,31 +91,25 @@ def _unit(x: jax.Array) -> jax.Array:
     return x * jax.lax.rsqrt(jnp.square(x).sum(-1, keepdims=True) + 1e-4)
 
 
-def evidence(p: Tree | None, values: jax.Array, seen: jax.Array, alike: jax.Array) -> jax.Array:
-    """Logits [k, p] of cuts: values [m, k, p, c] and seen [m, k, p] by `Described.at`.
+def evidence(p: Tree | None, own: jax.Array, values: jax.Array, weight: jax.Array) -> jax.Array:
+    """Logits [l, p] of cuts of a photo's pixels, of descriptions `own` [p, c], from those of k others there [k, l, p, c].
 
-    The best of the pairs of photos from different places (`alike`: `sweep.twins`) decides, softly, since one of a pair
-    may look at something in front.
+    weight: [k, l, p] whether another photo sees the cut, and from elsewhere. The best of the photos decides, softly,
+    since one may look at something in front.
     """
-    pairs, counts = [], []
-    for i in range(len(values)):
-        for j in range(i):
-            pairs.append(_agreement(p, values[i], values[j]))
-            counts.append(seen[i] * seen[j] * (1.0 - alike[i, j]))
-    if not pairs:
-        return jnp.full(seen.shape[1:], STRANGE)
-    agreed, both = jnp.stack(pairs), jnp.stack(counts)
+    agreed = jnp.stack([_agreement(p, own, other) for other in values])
     sharp = 1.0 if p is None else p["weights"][4]
-    count = both.sum(0)
-    best = jax.lax.stop_gradient(jnp.where(both > 0, agreed, -jnp.inf).max(0))
+    count = weight.sum(0)
+    best = jax.lax.stop_gradient(jnp.where(weight > 0, agreed, -jnp.inf).max(0))
     best = jnp.where(jnp.isfinite(best), best, 0.0)
-    mass = (both * jnp.exp(jnp.minimum(sharp * (agreed - best[None]), 0.0))).sum(0)
+    mass = (weight * jnp.exp(jnp.minimum(sharp * (agreed - best[None]), 0.0))).sum(0)
     level = best + jnp.log(mass / jnp.maximum(count, 1e-6) + 1e-9) / sharp
     return jnp.where(count > 0.5, level, STRANGE)
 
 
-def _agreement(p: Tree | None, a: jax.Array, b: jax.Array) -> jax.Array:
-    """Of two photos' values [k, p, c]. Sums along a short last axis are written out: they take ten times as long."""
+def _agreement(p: Tree | None, own: jax.Array, b: jax.Array) -> jax.Array:
+    """Of descriptions `own` [p, c] and another photo's [l, p, c]. Sums along a short last axis are written out: they take ten times as long."""
+    a = own[None]
     apart = [jnp.abs(a[..., c] - b[..., c]) for c in range(-4, 0)]
     colour = COLOUR / 3.0 * (apart[0] + apart[1] + apart[2])
     structure = jnp.minimum(apart[3], MOST)

@@ -1,8 +1,8 @@
 """Image-based rendering at any size: the photos' own pixels at the cut that a view's rays agree on.
 
 Blending weights and trust are found at the model's size (`recon.lookup`), depths at that and at twice of it
-(`recon.depth`); colours are read here, from photos as fine as they are given, so a picture is as sharp as they are. Where photos are finer than the picture they are read from a
-level of a pyramid that is not (Williams 1983).
+(`recon.surfaces`); colours are read here, from photos as fine as they are given, so a picture is as sharp as they are.
+Where photos are finer than the picture they are read from a level of a pyramid that is not (Williams 1983).
 """
 
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, summed
 Array = Any  # of JAX, or of NumPy before a program takes it
 LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
 DISAGREED = 0.05  # difference of the photos' colours at which half of the picture is not theirs
+CHOICE = 2.0  # exponent of the photos' shares: means of many photos are blurred
 FADE = 0.1  # weight of all photos below which they fade out
 
 
@@ -27,26 +28,24 @@ class Photos(NamedTuple):
     size: Array  # [m, 2] height and width of each in pixels of `rgb`
     scale: Array  # [m, 2] pixels of `rgb` in one of the model's, down and across
     offset: Array  # [m, 2] where the window begins in `rgb`
-    # What is made of them, where it was made before (`depth.prepared`): a pyramid of `rgb`, and what is compared.
+    # What is made of them, where it was made before (`depth.prepared`): a pyramid of `rgb`, and `depth.Depths`.
     pyramid: "Pyramid | None" = None
-    levels: Any = None
+    depths: Any = None
 
     def among(self, kept: jax.Array) -> "Photos":
         """Some of the photos [k], prepared as all of them are."""
         rgb, coarse, size, scale, offset = (x[kept] for x in self[:5])
-        pyramid, levels = self.pyramid, self.levels
+        pyramid, depths = self.pyramid, self.depths
         if pyramid is not None:
             pyramid = pyramid._replace(first=pyramid.first[:, kept])
-        if levels is not None:
-            levels = tuple(level.among(kept) for level in levels)
-        return Photos(rgb, coarse, size, scale, offset, pyramid, levels)
+        if depths is not None:
+            depths = depths.among(kept)
+        return Photos(rgb, coarse, size, scale, offset, pyramid, depths)
 
     def rescaled(self, ratio: Array) -> "Photos":
         """For another size of the model, whose pixels are `ratio` [1, 2] of those now (down, across)."""
-        levels = self.levels
-        if levels is not None:
-            levels = tuple(x._replace(photos=x.photos.rescaled(ratio)) for x in levels)
-        return self._replace(scale=self.scale * ratio, levels=levels)
+        depths = None if self.depths is None else self.depths.rescaled(ratio)
+        return self._replace(scale=self.scale * ratio, depths=depths)
 
     def shrunk(self, times: int = 1) -> "Photos":
         """The coarse ones in place of `rgb`; `times` as fine, of `rgb`."""
@@ -64,6 +63,21 @@ class Photos(NamedTuple):
         """`way`, in pixels of the model's photos, in pixels of these."""
         return moved_into(way, self.scale, self.offset)
 
+    @property
+    def frames(self) -> tuple[Array, Array]:
+        """(heights, widths) [m] of the photos."""
+        return self.size[:, 0], self.size[:, 1]
+
+    def window(self, i: Array) -> tuple[Array, Array]:
+        """`scale` and `offset` of one."""
+        return self.scale[i], self.offset[i]
+
+    def pixels(self, i: Array) -> Array:
+        """Centres [h w, 2] = (x, y) of the pixels of one, in pixels of the model's size."""
+        scale, offset = self.window(i)
+        h, w = self.rgb.shape[1:3]
+        return (pixels_of(h, w, 1) - offset[None, ::-1]) / scale[None, ::-1]
+
 
 class Blend(NamedTuple):
     """What a view takes from the photos; at the model's size, apart from the depths."""
@@ -71,6 +85,9 @@ class Blend(NamedTuple):
     inverse: jax.Array  # [v, ., .] inverse depth, at the model's size or larger
     step: jax.Array  # [v] between the inverse depths that were compared
     share: jax.Array  # [v, m, h, w, 1] of each photo
+    clear: (
+        jax.Array
+    )  # [v, m, ., ., 1] how much of each photo nothing in front hides, of the depths' size
     gate: jax.Array  # [v, h, w, 1] how much of the photos the mixture takes
     head: jax.Array  # [v, h, w, 3] the RGB head's picture
     rest: jax.Array  # [v, h, w, 3] what the mixture adds to both
@@ -151,7 +168,7 @@ def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, h
     h, w = blend.head.shape[:2]
     where = pixels_of(height, width, (h / height, w / width))
     inverse = enlarged(blend.inverse, height, width, TOGETHER * blend.step).reshape(1, -1)
-    met = meet_at(whole.into(way), where, inverse, (whole.size[:, 0], whole.size[:, 1]))
+    met = meet_at(whole.into(way), where, inverse, whole.frames)
     x, y, depth, seen = (found[:, 0] for found in met)
     finer = (
         whole.scale[:, 1] * w / width * scale
@@ -161,16 +178,19 @@ def _render(pyramid: Pyramid, whole: Photos, way: Motion, blend: Blend, scale, h
     m = len(colours)
     colours, seen = colours.reshape(m, height, width, 3), seen.reshape(m, height, width, 1)
 
-    share = _resized(blend.share, height, width) * seen
+    share = jnp.maximum(_resized(blend.share, height, width), 0.0) ** CHOICE
+    share = share / jnp.maximum(summed(share), EPS)[None]
+    share = share * _resized(blend.clear, height, width) * seen
     weight = summed(share)
     photos = summed(share * colours) / jnp.maximum(weight, EPS)  # [height, width, 3]
     head, rest, gate = (_resized(x, height, width) for x in (blend.head, blend.rest, blend.gate))
-    mixed = head + rest + gate * (photos - head)
+    found = jnp.clip(weight / FADE, 0.0, 1.0)
+    mixed = head + rest + found * gate * (photos - head)
     # The mixture is cautious. Where the photos agree with one another they are taken as they are.
     apart = summed(share * jnp.abs(colours - photos[None]))
     apart = (apart[..., :1] + apart[..., 1:2] + apart[..., 2:]) / 3.0
     apart = _resized(_resized(apart / jnp.maximum(weight, EPS), h, w), height, width)
-    trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * jnp.clip(weight / FADE, 0.0, 1.0)
+    trust = jax.nn.sigmoid(4.0 - 4.0 * apart / DISAGREED) * found
     return jnp.clip(mixed + trust * (photos - mixed), 0.0, 1.0)
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+CELL = 4  # pixels of a cell, along both axes
 NEAREST = 0.25  # depth of the last cut in the normalised scene; the first is at infinity
 SPACING = 1.5  # exponent: cuts are denser towards infinity
 SHARED = 0.1  # of a view's cells: cuts that two photos see in fewer of them are not looked at

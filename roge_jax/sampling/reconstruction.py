@@ -126,8 +126,10 @@ def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
     tokens = model.reconstruct(params, views, config=config)
     if full is None:
         return Known(tokens, views)
-    match = params["renderer"]["lookup"].get("match")
-    return Known(tokens, views | {"full": depth.prepared(match, full)})
+    match, size = params["renderer"]["lookup"].get("match"), (config.height, config.width)
+    cameras = views["K"], views["c2w"]
+    full = depth.prepared(match, full, *cameras, size=size, cuts=config.renderer.lookup)
+    return Known(tokens, views | {"full": full})
 
 
 def among(known: Known, kept: jax.Array) -> Known:

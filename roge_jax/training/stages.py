@@ -437,7 +437,7 @@ def held_out(
     from ..procedural.scenes import HELDOUT_SEED
 
     frames = max(24, config.frames + 3)
-    source = ProceduralSource(config.height, config.width, frames)
+    source = ProceduralSource(config.height, config.width, frames, depth=stage.views.depth)
     pool = [source[HELDOUT_SEED + i] for i in range(scenes)]
     views = stage.views.undisturbed()
     views = dataclasses.replace(views, contexts=(3,), context_weights=(1.0,), size=None)

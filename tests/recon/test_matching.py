@@ -1,4 +1,4 @@
-"""Matching of photos: learned features, evidence of pairs, surfaces coarse to fine, and what teaches the features."""
+"""Matching of photos: learned features, evidence of other photos, and what teaches the features."""
 
 import functools
 
@@ -8,9 +8,8 @@ import optax
 import pytest
 from compiled import compiled
 from test_lookup import CUTS, H, W, init, side_by_side, textured_plane
-from test_rendering import whole
 
-from roge_jax.recon import depth, matching, sweep
+from roge_jax.recon import matching, sweep
 from roge_jax.training.matching import matching_terms
 
 matching, sweep, matching_terms = map(compiled, (matching, sweep, matching_terms))
@@ -35,26 +34,21 @@ def values_of(colour: np.ndarray, match) -> np.ndarray:
 
 
 @pytest.mark.parametrize("learned", [False, True])
-def test_one_pair_that_agrees_is_enough_and_strangers_are_not(match, learned):
-    """A photo with something in front does not weaken the evidence that the two others agree on."""
+def test_one_photo_that_agrees_is_enough_and_strangers_are_not(match, learned):
+    """A photo with something in front does not weaken the evidence of the one that agrees."""
     p = match if learned else None
     colour = np.full((3, 4, 1, 3), 0.3)
     colour[:, 1, 0] = [[0.9, 0.1, 0.1], [0.1, 0.9, 0.1], [0.1, 0.1, 0.9]]  # three strangers
-    colour[2, 2] = 0.9  # two agree, one is occluded
-    seen = np.ones((3, 4, 1), np.float32)
-    seen[1:, 3] = 0.0  # one alone
-    found = functools.partial(matching.evidence, p, values_of(colour, p), seen)
-    alone, apart = np.asarray(found(np.ones((3, 3))))[:, 0], np.asarray(found(np.eye(3)))[:, 0]
-    assert apart[0] > apart[2] > apart[1] + 2.0
-    assert apart[0] - apart[2] < 1.5  # of three pairs one agrees: a factor of three
-    assert apart[3] == matching.STRANGE
-    np.testing.assert_allclose(alone, matching.STRANGE)  # from one place they are no witnesses
-
-
-def test_a_single_photo_gives_no_evidence(match):
-    values = values_of(np.full((1, 4, 2, 3), 0.3), match)
-    found = matching.evidence(match, values, np.ones((1, 4, 2)), np.eye(1))
-    np.testing.assert_allclose(found, matching.STRANGE)
+    colour[2, 2] = 0.9  # one agrees, one is occluded
+    values = values_of(colour, p)
+    seen = np.ones((2, 4, 1), np.float32)
+    seen[:, 3] = 0.0  # none
+    found = functools.partial(matching.evidence, p, values[0, 0], values[1:])
+    level = np.asarray(found(seen))[:, 0]
+    assert level[0] > level[2] > level[1] + 2.0
+    assert level[0] - level[2] < 1.0  # of two one agrees: a factor of two
+    assert level[3] == matching.STRANGE
+    np.testing.assert_allclose(found(0.0 * seen), matching.STRANGE)
 
 
 def test_descriptions_are_unit_vectors_in_front_of_colour_and_structure(match):
@@ -64,7 +58,8 @@ def test_descriptions_are_unit_vectors_in_front_of_colour_and_structure(match):
 
     @compiled
     def values(p, photos, way):
-        return matching.described(p, photos).at(way, where, once, (11, 14))[0]
+        held = matching.Described.of(matching.descriptions(p, photos))
+        return held.at(way, where, once, (11, 14))[0]
 
     read = [values(p, photos, still) for p in (match, None)]
     found, plain = (np.asarray(x).reshape(2, 11, 14, -1) for x in read)
@@ -82,35 +77,6 @@ def test_descriptions_are_unit_vectors_in_front_of_colour_and_structure(match):
     again = values(match, photos, sweep.Motion(turn, still.shift))
     again = np.asarray(again).reshape(2, 11, 14, -1)[..., : 2 * matching.VECTOR]
     np.testing.assert_array_equal(again, found[..., : 2 * matching.VECTOR])
-
-
-@pytest.mark.parametrize("learned", [False, True])
-def test_surfaces_lie_where_the_photos_agree(match, learned):
-    """A textured plane, seen by two photos: its inverse depth, finer than the distance between coarse cuts."""
-    p = match if learned else None
-    K, c2w = side_by_side(3, 0.15)
-    order = [1, 0, 2]
-    K, c2w = K[order], c2w[order]
-    true = float(sweep.inverse_depth(np.float32(8.4), CUTS))
-    big = textured_plane(
-        K * np.array([3, 3, 1.0], np.float32)[:, None], c2w, 1 / true, 3 * H, 3 * W
-    )
-    photos = whole(big[1:])
-    way = jax.tree.map(lambda x: x[0], sweep.motion(K[:1], c2w[:1], K[1:], c2w[1:]))
-    belief = np.zeros((CUTS, H // 4, W // 4))
-
-    @jax.jit
-    def find(photos):
-        levels = [depth.Level.of(p, photos.shrunk(times)) for times in (1, depth.FINER)]
-        alike = sweep.twins(c2w[1:])
-        return depth.surfaces(p, tuple(levels), way, belief, 1.0, alike, (H, W))
-
-    inverse, step = find(photos)
-    assert inverse.shape == (depth.FINER * H, depth.FINER * W)
-    middle = np.asarray(inverse)[12:-12, 40:-40]
-    one = float(sweep.inverse_depth(np.float32(9.4), CUTS)) - true
-    assert np.median(np.abs(middle - true)) < 0.25 * one
-    assert float(step) > 0.0
 
 
 def lesson(seed: int = 0):
@@ -148,8 +114,8 @@ def test_the_loss_of_matching_is_that_of_guessing_for_strangers_and_falls_when_t
     assert float(after["right"]) >= float(before["right"])
 
 
-def test_rays_of_points_that_one_photo_sees_teach_nothing(match):
+def test_rays_of_points_that_no_photo_sees_teach_nothing(match):
     views = lesson()
-    views["depth"][1] *= 0.5  # the second photo has something in front everywhere
+    views["depth"][:2] *= 0.5  # both photos have something in front everywhere
     terms = matching_terms(match, views, jax.random.key(0), cuts=CUTS)
     assert float(terms["loss"]) == 0.0 and float(terms["right"]) == 0.0

@@ -137,6 +137,7 @@ def plane(size: int):
         inverse=np.full((1, H, W), 1.0 / depth),
         step=np.full(1, 0.1),
         share=np.full((1, 2, H, W, 1), 0.5),
+        clear=np.ones((1, 2, H, W, 1)),
         gate=np.full((1, H, W, 1), 0.5),
         head=np.full((1, H, W, 3), 0.5),
         rest=np.zeros((1, H, W, 3)),
@@ -174,7 +175,8 @@ def test_what_the_model_is_not_shown_of_a_photo_is_read_too():
     )
     more = rendering.Photos(*map(np.asarray, (photo, photo, size, one, offset)))
     way = sweep.Motion(way.turn[:, :1], way.shift[:, :1])
-    blend = blend._replace(share=np.ones((1, 1, H, W, 1)))
+    only = np.ones((1, 1, H, W, 1))
+    blend = blend._replace(share=only, clear=only)
     shape = {"height": H, "width": W}
     cut, uncut = (
         np.asarray(rendering.render(x, way, blend, np.ones((1, 1)), **shape))[0]
@@ -197,7 +199,7 @@ def test_where_no_photo_sees_anything_the_mixture_stays():
         height=2 * H,
         width=2 * W,
     )
-    np.testing.assert_allclose(np.asarray(shown), 0.25, atol=1e-6)  # 0.5 + 0.5 (0 - 0.5)
+    np.testing.assert_allclose(np.asarray(shown), 0.5, atol=1e-6)  # no black: nothing is taken
 
 
 def test_photos_that_disagree_leave_the_picture_to_the_mixture():
@@ -206,6 +208,26 @@ def test_photos_that_disagree_leave_the_picture_to_the_mixture():
     shown = rendering.render(whole(photos), way, blend, np.ones((1, 2)), height=H, width=W)
     middle = np.asarray(shown)[0, 2:-2, 18:-18]
     np.testing.assert_allclose(middle, 0.5, atol=0.02)
+
+
+def test_a_photo_with_something_in_front_is_left_out_and_the_better_one_counts_more():
+    pictures, way, blend = plane(1)
+    photos = whole(np.stack([np.zeros_like(pictures[1]), np.full_like(pictures[2], 0.03)]))
+    blend = blend._replace(gate=np.ones_like(blend.gate))  # the photos alone
+
+    def shown(**changed):
+        made = rendering.render(
+            photos, way, blend._replace(**changed), np.ones((1, 2)), height=H, width=W
+        )
+        return np.asarray(made)[0, 4:-4, 18:-18]
+
+    def each(a: float, b: float):
+        return np.asarray([a, b]).reshape(1, 2, 1, 1, 1) * np.ones((1, 2, H, W, 1))
+
+    np.testing.assert_allclose(shown(clear=each(0.0, 1.0)), 0.03, atol=1e-4)
+    even, uneven = shown().mean(), shown(share=each(0.25, 0.75)).mean()
+    ratio = 3.0**rendering.CHOICE
+    np.testing.assert_allclose(uneven / even, 2 * ratio / (1 + ratio), rtol=1e-3)
 
 
 def test_look_up_gives_the_picture_at_both_sizes():
