@@ -1,7 +1,6 @@
 """Procedural scenes: exact depth, conventions, determinism, splits, one trace, pools."""
 
 import multiprocessing
-import sys
 
 import jax
 import jax.numpy as jnp
