@@ -198,7 +198,7 @@ def table(rows: dict[str, dict]) -> list[str]:
                 f"{dtype}[{','.join(map(str, shape))}]",
                 f"{row['compile_seconds']['cpu']:.0f}",
                 f"{row['host_bytes'] / 1e9:.1f}" if "host_bytes" in row else "",
-                "no Triton products" if row["options"] else "",
+                row.get("note") or ("no Triton products" if row["options"] else ""),
             ]
         )
     columns = ["preset", "size", "program, device", "data, fsdp, seq", "arguments"]
@@ -213,18 +213,20 @@ def _beside(said: float, planned: float | None, unit: float, form: str) -> str:
 
 
 def changes(rows: dict[str, dict], before: dict[str, dict]) -> list[str]:
-    """The steps that were also compiled before products had a rule of their own."""
+    """The steps that were compiled before products had a rule of their own, and what they are now."""
     lines = []
-    for name in (name for name in rows if name in before and "flops" in rows[name]):
+    for name, old in before.items():
         one, cells = case(name), []
-        for row in (before[name], rows[name]):
-            total = sum(row["flops"].values())
-            wide = row["flops"].get("f32", 0.0)
+        for row in (old, rows.get(name, {})):
+            if "flops" not in row:
+                cells += ["", ""]
+                continue
+            total, wide = sum(row["flops"].values()), row["flops"].get("f32", 0.0)
             cells += [f"{wide / 1e12:.0f} ({wide / total:.1%})", f"{held(row) / 1e9:.1f}"]
-        mesh = ", ".join(name.split(",")[4:])
-        lines.append([f"{one.program}, {one.size}, {one.device}", mesh, cells[0], cells[2], cells[1], cells[3]])  # fmt: skip
-    columns = ["step of `paper`", "data, fsdp, seq", "float32 TFLOP, before", "now", "all, before", "now"]  # fmt: skip
-    return harness.table(columns, lines)
+        mesh = ", ".join(map(str, one.sizes))
+        lines.append([f"{one.program}, {one.size}, {one.device}", mesh, *cells])
+    columns = ["step of `paper`", "data, fsdp, seq", "float32 TFLOP, before", "all, before"]
+    return harness.table([*columns, "float32 TFLOP, now", "all, now"], lines)
 
 
 def write(rows: dict[str, dict], before: dict[str, dict]) -> list[str]:

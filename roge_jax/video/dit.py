@@ -1,8 +1,8 @@
 """The Wan2.1 diffusion transformer: noisy latents and their conditions to a velocity.
 
 One scene, no batch axis (`jax.vmap` adds it). Token order is slot, row, column. The residual stream, the norms, the
-modulation and the rotations are float32; matrix products take their inputs in the dtype of their kernel, attention
-in that of the query kernel. The depth is stacked leaves under `blocks`, walked by one `lax.scan`.
+modulation and the rotations are float32; matrix products and attention between them read what `core.products` says.
+The depth is stacked leaves under `blocks`, walked by one `lax.scan`.
 """
 
 from collections.abc import Sequence
