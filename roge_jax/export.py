@@ -1,6 +1,7 @@
-"""What is made, for other programs: videos of a finished run, and trained adapters.
+"""What is made, for other programs: videos and points of a finished run, and trained adapters.
 
     python -m roge_jax.export RUN --video gif,webm                       more kinds of video, from the frames that are there
+    python -m roge_jax.export RUN --points                               points.ply, triangulated from the frames
     python -m roge_jax.export ADAPTER --merge BASE --out DIR             a whole model
     python -m roge_jax.export ADAPTER --style comfyui --out DIR          LoRA for another program
 
@@ -43,6 +44,8 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("folder", type=Path, help="folder that sample wrote, or adapter of training")
     kinds = "of a run: write these kinds of video, with commas: mp4, webm, webp, gif"
     p.add_argument("--video", type=video_kinds, metavar="KINDS", help=kinds)
+    points = "of a run: triangulate coloured points from its frames (points.ply, transforms.json, sparse/0)"
+    p.add_argument("--points", action="store_true", help=points)
     fps = "with --video: frames per second (default: those of the run)"
     p.add_argument("--fps", type=number(1e-3, 1000, whole=False), help=fps)
     merge = "of an adapter: model folder or name to merge it into"
@@ -67,12 +70,13 @@ def main(args: argparse.Namespace) -> None:
     """Write what was asked for of a run or of an adapter."""
     from .errors import UserError
 
-    if sum(map(bool, (args.video, args.merge, args.style))) != 1:
+    of_a_run = bool(args.video or args.points)
+    if sum(map(bool, (of_a_run, args.merge, args.style))) != 1:
         raise UserError(
-            "Give one of --video for a finished run, --merge BASE for a whole model of an adapter, or --style for other "
-            "programs' LoRA files."
+            "Give --video or --points for a finished run; of an adapter one of --merge BASE for a whole model, and --style "
+            "for other programs' LoRA files."
         )
-    if args.video:
+    if of_a_run:
         return export_run(args)
     from .checkpoint import load_adapter
     from .weights.importer import check_output
@@ -93,8 +97,10 @@ def export_run(args: argparse.Namespace) -> None:
     from .sampling import finished
 
     made = finished.read(args.folder)
-    for file in finished.write_videos(made, args.video, args.fps):
+    for file in finished.write_videos(made, args.video or (), args.fps):
         print(f"{file}: written, {len(made.names)} frames")
+    if args.points:
+        print(f"{args.folder / finished.POINTS}: {finished.write_points(made)}")
 
 
 def merge_into(base: str, tree, config, adapter: Path, out: Path, *, shard_bytes: float) -> None:

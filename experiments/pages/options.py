@@ -22,7 +22,8 @@ from experiments import harness
 PAGE, PATHS = harness.DOCS / "reference" / "programs.md", harness.DOCS / "howto" / "paths.md"
 HEAD = """# Programs and their options
 
-Every program is a module: `python -m roge_jax.NAME`. Give `--help` for the same list on a terminal.
+Every program is a module: `python -m roge_jax.NAME`, or `roge NAME` where the package is installed. `python -m roge_jax` lists them.
+Give `--help` for the same options on a terminal.
 This page is written from the programs by `python -m experiments.pages.options`.
 
 A mistake is one sentence, and the exit code is 2. [All sentences](messages.md) have a page of their own.

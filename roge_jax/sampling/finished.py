@@ -2,8 +2,10 @@
 
 made = read(Path("outputs/sample"))
 write_videos(made, ["gif"])
+quality = write_points(made)  # points.ply, and the same points in transforms.json and sparse/0
 """
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,9 +15,14 @@ import numpy as np
 from ..errors import UserError
 from ..files import video_io
 from ..files.fields import is_file, read_json
-from ..files.folders import RECORD, check_disk
+from ..files.folders import RECORD, check_disk, write_json
+from ..scenes.points import write_ply
+from ..scenes.scene import load_scene
+from ..scenes.triangulate import Quality, triangulate
 from . import outputs
 from .inputs import FPS
+
+POINTS = "points.ply"
 
 
 class Finished(NamedTuple):
@@ -70,9 +77,40 @@ def read(folder: Path) -> Finished:
 
 def write_videos(made: Finished, kinds: Sequence[str], fps: float | None = None) -> list[Path]:
     """video.KIND of the frames, into the run's folder."""
+    if not kinds:
+        return []
     frames, fps = made.frames(), fps or made.fps
     check_disk(frames.nbytes / 2, made.folder, "The video")
     return [
         video_io.write_video(made.folder / f"video.{kind}", frames, fps, about=made.about)
         for kind in kinds
     ]
+
+
+def write_points(made: Finished) -> Quality:
+    """Points triangulated from the frames, into the run's folder: points.ply, and into its transforms.json and COLMAP model,
+    which 3D Gaussian trainers start from.
+
+    Raises: UserError for a folder without cameras or with other frames than its cameras are for, and if there are none.
+    """
+    file, count = made.folder / "transforms.json", len(made.names)
+    if not is_file(file):
+        raise UserError(
+            f"{made.folder}: has no transforms.json with the cameras of its frames: give the folder of a finished run."
+        )
+    scene = load_scene(file)
+    if scene.names[:count] != made.names or len(set(scene.sizes)) > 1:
+        raise UserError(
+            f"{file}: does not begin with the {count} frames of {made.folder / outputs.FRAMES}, all of one size: give the "
+            "folder as `sample` wrote it."
+        )
+    points, quality = triangulate(made.frames(), scene.cameras[:count])
+    write_ply(made.folder / POINTS, points, about=made.about)
+    others = len(scene) - count  # photos, into which nothing was followed
+    seen = [*(points.seen or ()), *[np.zeros(0, int)] * others]
+    pixels = [*(points.pixels or ()), *[np.zeros((0, 2))] * others]
+    points = dataclasses.replace(points, seen=seen, pixels=pixels)
+    given = scene.names, scene.cameras, scene.sizes[0], points
+    outputs.write_model(made.folder, *given, about=made.about)
+    write_json(file, read_json(file) | {"ply_file_path": POINTS})
+    return quality

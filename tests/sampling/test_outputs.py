@@ -14,7 +14,7 @@ from roge_jax import export, sample, sampling
 from roge_jax.config import preset
 from roge_jax.errors import UserError
 from roge_jax.files import entry, folders, video_io
-from roge_jax.geometry.cameras import invert, normalise
+from roge_jax.geometry.cameras import Cameras, invert, normalise
 from roge_jax.sampling import finished, outputs
 from roge_jax.scenes.paths import load_path
 from roge_jax.scenes.points import Points
@@ -346,8 +346,8 @@ def test_more_kinds_of_video_of_a_finished_run(place, capsys):
     ("words", "said"),
     [
         (["scene", "--video", "gif"], "has no frames"),
-        (["scene"], "Give one of --video"),
-        (["scene", "--video", "gif", "--merge", "mini"], "Give one of --video"),
+        (["scene"], "Give --video or --points"),
+        (["scene", "--video", "gif", "--merge", "mini"], "Give --video or --points"),
         (["scene", "--merge", "mini"], "No --out given"),
     ],
 )
@@ -386,3 +386,41 @@ def test_what_is_known_is_no_warning_but_in_the_result(recwarn):
     assert not [one for one in recwarn if "distinct" in str(one.message)]
     limits.warn(images, two, two, "mini", (0, 1))
     assert [one for one in recwarn if "distinct" in str(one.message)]
+
+
+def test_points_of_a_finished_run(tmp_path, capsys):
+    """points.ply, the COLMAP model with tracks, and transforms.json name the same points."""
+    pycolmap = pytest.importorskip("pycolmap")
+    from test_triangulate import HEIGHT as H
+    from test_triangulate import WIDTH as W
+    from test_triangulate import sideways, wall
+
+    from roge_jax.scenes.paths import transforms
+    from roge_jax.scenes.points import read_ply
+
+    cameras = sideways()
+    names = video_io.write_frames(tmp_path / "frames", wall(cameras))
+    shutil.copytree(tmp_path / "frames", tmp_path / "images")
+    shutil.copyfile(tmp_path / "images" / "0000.png", tmp_path / "images" / "photo00.png")
+    every = Cameras(cameras.K[[*range(7), 0]], cameras.c2w[[*range(7), 0]])
+    content = transforms([*names, "photo00.png"], every, H, W, folder="images")
+    folders.write_json(tmp_path / "transforms.json", content | {"roge_jax": {"path_frames": 7}})
+    assert entry.execute(export.main, export.parser(), [str(tmp_path), "--points"]) == 0
+    said = capsys.readouterr().out
+    points = read_ply(tmp_path / "points.ply")
+    assert f"points.ply: {len(points)} points of " in said and "reprojection error 0." in said
+    model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
+    assert model.num_points3D() == len(points) > 60 and model.num_images() == 8
+    assert model.compute_mean_track_length() > 4
+    stored = model.compute_mean_reprojection_error()
+    model.update_point_3d_errors()
+    assert (
+        model.compute_mean_reprojection_error() == pytest.approx(stored, abs=1e-3) and stored < 0.3
+    )
+    np.testing.assert_allclose(load_scene(tmp_path).points.xyz, points.xyz)
+
+
+def test_points_need_cameras(tmp_path, capsys):
+    video_io.write_frames(tmp_path / "frames", np.zeros((3, 24, 32, 3)))
+    assert entry.execute(export.main, export.parser(), [str(tmp_path), "--points"]) == 2
+    assert "has no transforms.json" in capsys.readouterr().err

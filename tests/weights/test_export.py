@@ -174,7 +174,10 @@ def test_lora_of_the_transformer_for_other_programs(adapter, tmp_path, style, ca
 def test_what_does_not_fit_is_named(base, adapter, tmp_path):
     checkpoint.save_adapter(tmp_path / "a", adapter, SMALL)
     checkpoint.save_model(tmp_path / "base", base, SMALL)
-    with pytest.raises(UserError, match="Give one of --video for a finished run, --merge BASE"):
+    with pytest.raises(
+        UserError,
+        match="Give --video or --points for a finished run; of an adapter one of --merge BASE",
+    ):
         run(tmp_path / "a", "--out", tmp_path / "m")
     with pytest.raises(UserError, match="unknown value 'diffuser': did you mean 'diffusers'"):
         run(tmp_path / "a", "--style", "diffuser", "--out", tmp_path / "m")
