@@ -15,7 +15,7 @@ from .sweep import EPS, Motion, bilinear, meet_at, moved_into, pixels_of, summed
 
 Array = Any  # of JAX, or of NumPy before a program takes it
 LEVELS = 3  # of the pyramid: photos up to four times finer than the picture do not alias
-DISAGREED = 0.05  # difference of the photos' colours at which half of the picture is not theirs
+DISAGREED = 0.1  # difference of the photos' colours at which half of the picture is not theirs
 CHOICE = 2.0  # exponent of the photos' shares: means of many photos are blurred
 FADE = 0.1  # weight of all photos below which they fade out
 
