@@ -70,9 +70,7 @@ class About(NamedTuple):
     """What a fine level compares: depths between the coarse answers around a pixel, and a little beyond."""
 
     inverse: jax.Array  # [LABELS, h, w]
-    cost: (
-        jax.Array
-    )  # [LABELS, h, w] nats, of leaving the coarse answer: it stays if nothing is said
+    cost: jax.Array  # [LABELS, h, w] nats, of leaving the coarse answer
 
     @classmethod
     def of(cls, cut: jax.Array, cuts: int, reach: jax.Array, size: tuple[int, int]) -> "About":
