@@ -107,6 +107,10 @@ def parser() -> argparse.ArgumentParser:
     fps_help = f"frames per second; the path file's own, else {FPS:g}"
     option("--fps", fps_help, type=number(1e-3, 1000, whole=False))
     video_help = "kinds of video, with commas: mp4, webm, webp, gif (default: mp4)"
+    exr_help = (
+        "also write exr/0000.exr ..: the frames in float and linear light, with their cameras"
+    )
+    p.add_argument("--exr", action="store_true", help=exr_help)
     p.add_argument("--video", default=("mp4",), type=video_kinds, metavar="KINDS", help=video_help)
     option("--dtype", "of large matrices: auto, float32, bfloat16", "auto", type=one_of(DTYPES))
     mesh_help = "how to split the work over devices, e.g. fsdp=2,seq=2: weights; tokens and views (one device if not given)"
@@ -167,7 +171,9 @@ def main(args: argparse.Namespace) -> None:
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
             size = config.output_size
-            kinds = outputs.check_outputs(folder, args.video, len(path), size, args.fps)
+            kinds = outputs.check_outputs(
+                folder, args.video, len(path), size, args.fps, exr=args.exr
+            )
             params, _ = load_weights(args, mesh, reconstruction.PARTS if only else None)
         beside = Beside(scene, photos.ids, config, args.convention)
         print(begun(args, scene, config, photos, path))
@@ -208,6 +214,7 @@ def main(args: argparse.Namespace) -> None:
             write_json(folder / RECORD, record())  # also beside frames whose video fails
             told: dict[str, Any] = {
                 "kinds": kinds,
+                "exr": args.exr,
                 "generated": not only,
                 "about": outputs.remark(to_dict(config), used),
             }

@@ -44,13 +44,20 @@ def remark(config: dict[str, Any], settings: dict[str, Any], release: str | None
 
 
 def check_outputs(
-    folder: Path, kinds: Sequence[str], frames: int, size: tuple[int, int], fps: float
+    folder: Path,
+    kinds: Sequence[str],
+    frames: int,
+    size: tuple[int, int],
+    fps: float,
+    *,
+    exr: bool = False,
 ) -> tuple[str, ...]:
     """The kinds of video that can be written here in place of `kinds`, before anything is computed.
 
     Raises: UserError for pictures that no codec takes, and for a disk that has no room for them.
     """
-    check_disk(ROOM * 3 * frames * size[0] * size[1] + 1e6, folder, "The video")
+    each = 3 * ROOM + (3 * 4 if exr else 0)  # bytes a pixel
+    check_disk(each * frames * size[0] * size[1] + 1e6, folder, "The video")
     return video_io.usable_kinds(folder, kinds, *size, fps)
 
 
@@ -64,10 +71,13 @@ def write_outputs(
     kinds: Sequence[str] = ("mp4",),
     generated: bool = True,
     about: str | None = None,
+    exr: bool = False,
 ) -> None:
     """All files but run.json. Where nothing is generated the frames are the preview, which is not written twice."""
     names = video_io.write_frames(folder / FRAMES, result.frames, about=about)
     write_scene(folder, names, result, scene, photos, about=about, fps=fps)
+    if exr:
+        write_floats(folder / "exr", result, about=about)
     for kind in kinds:
         video_io.write_video(folder / f"video.{kind}", result.frames, fps, about=about)
     rows: dict[str, Any] = {"photos": photos.images}
@@ -78,6 +88,16 @@ def write_outputs(
     rows["preview (reconstruction)"] = result.preview
     sheet = video_io.contact_sheet(rows)
     video_io.write_png(folder / "contact_sheet.png", sheet, about=about)
+
+
+def write_floats(folder: Path, result: Result, *, about: str | None) -> None:
+    """exr/0000.exr ..: the frames before they are rounded to 8 bits, each with its camera (`files.exr`)."""
+    from ..files import exr
+
+    folder.mkdir()
+    cameras = result.cameras
+    for i, (frame, K, c2w) in enumerate(zip(result.frames, cameras.K, cameras.c2w, strict=True)):
+        exr.write_exr(folder / f"{i:04d}.exr", exr.Picture(frame, None, K, c2w, about))
 
 
 def write_scene(

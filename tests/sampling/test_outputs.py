@@ -179,6 +179,21 @@ def test_every_file_says_where_it_came_from(place):
         assert one["config"]["dit"]["width"] == CONFIG.dit.width and "seed" in one
 
 
+def test_frames_in_float_have_their_cameras(place):
+    """What 8 bits lose is there, and K and pose are those of transforms.json."""
+    from roge_jax.files import exr
+
+    assert run(place, "--exr") == 0
+    out = place.root / "out"
+    assert len(list((out / "exr").iterdir())) == COUNT
+    scene, found = load_scene(out), exr.read_exr(out / "exr" / "0003.exr")
+    frames = np.random.default_rng(0).random((COUNT, *SIZE, 3), np.float32)
+    np.testing.assert_allclose(found.rgb, frames[3], atol=1e-6)
+    np.testing.assert_allclose(found.c2w, scene.cameras.c2w[3], atol=1e-12)
+    np.testing.assert_allclose(found.K, scene.cameras.K[3], atol=1e-9)
+    assert json.loads(found.about)["model"] == "tiny"
+
+
 def test_a_gif_keeps_its_colours(tmp_path):
     """The palette is that of all frames: colours that only the last one has are there."""
     from PIL import Image
@@ -267,7 +282,7 @@ def test_frames_stay_where_a_video_fails_and_one_sentence_says_how_to_go_on(
     before = (place.root / "out" / "video.mp4").read_bytes()
     with monkeypatch.context() as broken:
         broken.setattr(video_io, "_write_h264", full)
-        broken.setattr(outputs, "check_outputs", lambda *_: ("mp4",))
+        broken.setattr(outputs, "check_outputs", lambda *_, **more: ("mp4",))
         capsys.readouterr()
         assert run(place) == 1 and run(place) == 1
     said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error:")]
