@@ -192,9 +192,7 @@ def find_model(name: str | Path) -> Path:
     from .weights import hub
 
     if hub.asks_hub(name):
-        load_config(
-            hub.fetch(str(name), ("config.json",))
-        )  # before gigabytes of something else come
+        load_config(hub.fetch(str(name), ("config.json",)))  # before gigabytes come
         return hub.fetch(str(name), ("config.json", "*.safetensors"))
     folder = Path(name)
     if is_file(folder / "config.json"):

@@ -52,7 +52,7 @@ def rounded(dtype: Any) -> bool:
 def cpu_units() -> bool:
     """Whether this machine's CPU multiplies bfloat16; without, XLA widens what it is given, which costs more than float32."""
     try:
-        words = Path("/proc/cpuinfo").read_text().split()
+        words = Path("/proc/cpuinfo").read_text(encoding="utf-8").split()
     except OSError:
         return False
     return any(unit in words for unit in UNITS)

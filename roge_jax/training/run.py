@@ -17,6 +17,7 @@ from ..core.params import init as init_specs
 from ..cost import kept_as
 from . import loop, stages, start
 from .diagnose import joint_diagnose
+from .held_out import held_out
 from .stages import Stage
 
 
@@ -166,7 +167,7 @@ def _fit(
     )
     evaluate = diagnose = writer = None
     if options.evaluate_every:
-        evaluate = stages.held_out(objective, parts.frozen, stage, working, encode=encode)
+        evaluate = held_out(objective, parts.frozen, stage, working, encode=encode)
     del encode  # and with it the networks that encode
     if options.diagnose_every and stage.objective == "joint":
         diagnose = joint_diagnose(working)

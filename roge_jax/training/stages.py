@@ -125,14 +125,13 @@ def encoded_objective(trainable, frozen, batch, key, *, config, stage):
 
 def objective_of(config: RoGeConfig, stage: Stage) -> Callable:
     """objective(trainable, frozen, batch, key) -> (loss, terms) of a stage; `config` is its own (`stage_config`)."""
+    return functools.partial(_objective, config=config, stage=stage)
 
-    def objective(trainable, frozen, batch, key):
-        with products.use(stage.products):
-            return OBJECTIVES[stage.objective](
-                trainable, frozen, batch, key, config=config, stage=stage
-            )
 
-    return objective
+def _objective(trainable, frozen, batch, key, *, config, stage):
+    with products.use(stage.products):
+        objective = OBJECTIVES[stage.objective]
+        return objective(trainable, frozen, batch, key, config=config, stage=stage)
 
 
 LEVELS = 0.3  # weight of the look-up's levels beside its picture
@@ -424,34 +423,3 @@ def _on_clips(function, params: Tree, source, config: RoGeConfig, seed: int, cli
         one = np.asarray(run(weights, {name: x[0] for name, x in batch.items()}), np.float64)
         found.append(one.reshape(-1, one.shape[-1]))
     return np.concatenate(found)
-
-
-def held_out(
-    objective, frozen: Tree, stage: Stage, config: RoGeConfig, scenes: int = 16, encode=None
-):
-    """evaluate(trainable) -> the stage's own terms on held-out scenes of the kind that is rendered for training, prefixed `held_`.
-
-    `encode`: from the arrays of one sample to those that the objective takes; None: as they are.
-    """
-    from ..data.source import ProceduralSource
-    from ..procedural.scenes import HELDOUT_SEED
-
-    frames = max(24, config.frames + 3)
-    source = ProceduralSource(config.height, config.width, frames, depth=stage.views.depth)
-    pool = [source[HELDOUT_SEED + i] for i in range(scenes)]
-    views = stage.views.undisturbed()
-    views = dataclasses.replace(views, contexts=(3,), context_weights=(1.0,), size=None)
-    fixed = dataclasses.replace(stage, views=views, batch=4)
-    batches = [stage_batch(pool, fixed, config, 0, i) for i in range(scenes // 4)]
-    if encode is not None:
-        batches = [encoded.each(encode, batch) for batch in batches]
-    run = jax.jit(objective)
-
-    def evaluate(trainable: Tree) -> dict[str, float]:
-        results = [run(trainable, frozen, batch, jax.random.key(0)) for batch in batches]
-        row = {"held_loss": float(np.mean([loss for loss, _ in results]))}
-        for name in results[0][1]:
-            row[f"held_{name}"] = float(np.mean([terms[name] for _, terms in results]))
-        return row
-
-    return evaluate

@@ -97,7 +97,7 @@ def test_transformer_equals_one_device():
         def one(x0, appearance, tokens):
             cond = model.Condition(appearance, tokens)
             return model.flow_matching(
-                params, x0, cond, jax.random.key(3), config=cfg, contexts=CONTEXTS
+                params, x0, cond, jax.random.key(4), config=cfg, contexts=CONTEXTS
             )
 
         over = jax.vmap(one, spmd_axis_name=sharding.batch_axes(SCENES))

@@ -103,7 +103,15 @@ def test_the_program_loads_and_runs_no_generator(place, monkeypatch):
     assert program(place, "--trajectory", "orbit", "--frames", 7, "--out", out) == 0
     assert seen == [{"encoder", "renderer"}]
     names = sorted(p.name for p in out.iterdir())
-    assert names == ["contact_sheet.png", "frames", "run.json", "transforms.json", "video.mp4"]
+    assert names == [
+        "contact_sheet.png",
+        "frames",
+        "images",
+        "run.json",
+        "sparse",
+        "transforms.json",
+        "video.mp4",
+    ]
     assert len(video_io.read_video(out / "video.mp4")) == 7
     run = json.loads((out / "run.json").read_text())
     assert run["generated"] is False and run["evaluations"] == 0

@@ -867,7 +867,7 @@ def test_wrong_arguments_from_python_are_named(weights, photos):
         sampling.sample(weights, CONFIG, small, path, SETTINGS)
     size = (CONFIG.recon_height, CONFIG.recon_width)
     for kept, generate, said in (
-        ((0,), ((0, WINDOW), (WINDOW, 2 * WINDOW)), "2 windows"),
+        ((0,), ((0, WINDOW), (WINDOW, 2 * WINDOW)), "2 chunks"),
         ((7,), ((0, WINDOW),), "photo 7 of 4"),
     ):
         choices = sampling.Choices(kept, 2, "euler", "uniform", size, 1, generate, WINDOW)

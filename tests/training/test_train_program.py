@@ -19,8 +19,10 @@ from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
 from roge_jax.files import entry
 from roge_jax.files.folders import BLOCK_BYTES, BLOCKS, fingerprint
+from roge_jax.procedural import scenes as procedural
 from roge_jax.training import diagnose, loop, stages
 from roge_jax.training import run as training_run
+from roge_jax.training.held_out import held_out
 from roge_jax.training.start import hold_settings
 
 
@@ -187,24 +189,38 @@ def test_a_preview_is_measured_again_once_the_latents_moved(monkeypatch):
     assert found == {"vae_longer": None, "vae_decoder": spread}
 
 
+def drawn_sequence(seed, *, frames, height, width, depth, varied):
+    """In place of a rendered scene: `procedural.scenes.sample_sequence`."""
+    assert seed >= procedural.HELDOUT_SEED and varied  # of the kind that training draws
+    rng = np.random.default_rng(seed)
+    c2w = np.tile(np.eye(4), (frames, 1, 1))
+    c2w[:, :3, 3] = rng.standard_normal((frames, 3))
+    K = np.tile(np.diag([40.0, 40.0, 1.0]), (frames, 1, 1))
+    rgb = rng.integers(0, 256, (frames, height, width, 3), dtype=np.uint8)
+    further = {"depth": np.ones((frames, height, width), np.float16)} if depth else {}
+    return {"rgb": rgb, "K": K, "c2w": c2w, **further}
+
+
+def test_held_out_scenes_have_depth_where_the_stage_learns_from_it(monkeypatch):
+    monkeypatch.setattr(procedural, "sample_sequence", drawn_sequence)
+    cfg = config.preset("tiny")
+    stage = stages.find_stage(stages.mini_stages(size=(cfg.height, cfg.width)), "match")
+    at = stages.stage_config(cfg, stage)
+
+    def objective(trainable, frozen, batch, key):
+        return batch["depth"].mean(), {}
+
+    assert held_out(objective, {}, stage, at, scenes=4)({})["held_loss"] > 0.0
+
+
 def test_held_out_scenes_are_scored_undisturbed(monkeypatch):
     """However a stage draws and alters its samples: the same views, pictures and cameras are scored."""
-    from roge_jax.procedural import scenes as procedural
-
-    def sequence(seed, *, frames, height, width, depth, varied):
-        assert seed >= procedural.HELDOUT_SEED and varied  # of the kind that training draws
-        rng = np.random.default_rng(seed)
-        c2w = np.tile(np.eye(4), (frames, 1, 1))
-        c2w[:, :3, 3] = rng.standard_normal((frames, 3))
-        K = np.tile(np.diag([40.0, 40.0, 1.0]), (frames, 1, 1))
-        rgb = rng.integers(0, 256, (frames, height, width, 3), dtype=np.uint8)
-        return {"rgb": rgb, "K": K, "c2w": c2w}
 
     def objective(trainable, frozen, batch, key):
         told = {name: x.mean() + x.std() for name, x in batch.items()}
         return told["context_rgb"], told
 
-    monkeypatch.setattr(procedural, "sample_sequence", sequence)
+    monkeypatch.setattr(procedural, "sample_sequence", drawn_sequence)
     cfg = config.preset("tiny")
     stage = stages.find_stage(stages.mini_stages(frames=cfg.frames), "lookup")
     scores = []
@@ -214,7 +230,7 @@ def test_held_out_scenes_are_scored_undisturbed(monkeypatch):
     ):
         views = dataclasses.replace(stage.views, **change)
         one = dataclasses.replace(stage, views=views, batch=2)
-        scores.append(stages.held_out(objective, {}, one, cfg, scenes=4)({}))
+        scores.append(held_out(objective, {}, one, cfg, scenes=4)({}))
     assert scores[0] == scores[1]
     assert set(scores[0]) >= {"held_loss", "held_K", "held_c2w", "held_target_rgb"}
 

@@ -250,9 +250,9 @@ class TestRoom:
         found = room.memory_available()
         assert found is None or 1e7 < found < 1e14
         said = "MemTotal:  9000 kB\nMemFree:   10 kB\nMemAvailable:   700 kB\nBuffers:   5 kB\n"
-        monkeypatch.setattr(memory.Path, "read_text", lambda file: said)
+        monkeypatch.setattr(memory.Path, "read_text", lambda file, encoding: said)
         assert memory.memory_available() == 700 * 1024
-        monkeypatch.setattr(memory.Path, "read_text", lambda file: "nothing")
+        monkeypatch.setattr(memory.Path, "read_text", lambda file, encoding: "nothing")
         assert memory.memory_available() is None
 
     def test_the_smallest_device_tells_the_memory_of_all(self):
