@@ -338,7 +338,7 @@ class TestRecord:
     def test_peak_memory_is_in_gigabytes(self, monkeypatch):
         said = "VmPeak:\t  9000000 kB\nVmHWM:\t  2000000 kB\nVmRSS:\t  1000000 kB\n"
         monkeypatch.setattr(entry.Path, "exists", lambda file: True)
-        monkeypatch.setattr(entry.Path, "read_text", lambda file: said)
+        monkeypatch.setattr(entry.Path, "read_text", lambda file, encoding: said)
         assert entry.peak_memory()["peak_memory_gb"] == 2.048
 
     def test_environment_names_versions_and_commit(self):
