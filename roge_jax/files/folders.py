@@ -60,7 +60,7 @@ def output_folder(out: str | Path, *, keep: str = "") -> Iterator[Path]:
             shutil.rmtree(part, ignore_errors=True)
             if kept is None:
                 raise
-            told = f"{_cause(error)} {kept}"
+            told = f"{_cause(error, given)} {kept}"
             if isinstance(error, OSError | UserError | MemoryError):
                 raise OutputError(told) from error
             warnings.warn(kept, stacklevel=3)  # a fault of the program, or an interruption
@@ -85,9 +85,9 @@ def _keep(part: Path, out: Path, frames: str) -> str | None:
     )
 
 
-def _cause(error: BaseException) -> str:
+def _cause(error: BaseException, out: object) -> str:
     if isinstance(error, OSError) and error.errno is not None:
-        return system_sentence(error)
+        return system_sentence(OSError(error.errno, error.strerror, error.filename or str(out)))
     if isinstance(error, MemoryError):
         return f"Out of memory ({error})."
     return f"{str(error).rstrip('.')}."
