@@ -145,7 +145,8 @@ def test_sample_makes_the_picture_and_says_so(place, capsys):
     words = ["--checkpoint", place / "lager", "--scene", place / "scene", "--size", SIZE]
     assert run(sample, *words, "--trajectory", "orbit", "--frames", 3, "--out", out) == 0
     names = sorted(p.name for p in out.iterdir())
-    assert names == ["contact_sheet.png", "frames", "run.json", "transforms.json", "video.mp4"]
+    scene = {"images", "sparse", "transforms.json"}
+    assert names == sorted({"contact_sheet.png", "frames", "run.json", "video.mp4"} | scene)
     record = json.loads((out / "run.json").read_text())
     assert record["generated"] is False and record["size"] == [48, 64]
     assert record["seconds_per_frame"] == pytest.approx(
