@@ -96,8 +96,7 @@ def api_pages() -> dict[str, str]:
     pages = {}
     for path in sorted((ROOT / "roge_jax").rglob("*.py")):
         file = path.relative_to(ROOT).as_posix()
-        if path.name != "__main__.py":
-            pages[api_page(file)] = f"# {module(file)}\n\n::: {module(file)}\n"
+        pages[api_page(file)] = f"# {module(file)}\n\n::: {module(file)}\n"
     return pages
 
 

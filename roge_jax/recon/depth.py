@@ -141,7 +141,9 @@ def depths(
 
     Args:
       match: leaves of `recon.matching`; None compares colours alone.
-      K, c2w: [m, 3, 3] in pixels of the model's `size` (height, width), [m, 4, 4] normalised.
+      K: [m, 3, 3] in pixels of the model's size.
+      c2w: [m, 4, 4] normalised.
+      size: (height, width) of the model's photos.
       cuts: inverse depths that the coarse level compares.
     """
     if photos.depths is not None:

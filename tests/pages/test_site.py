@@ -62,6 +62,19 @@ def test_functions_that_pages_name_are_there(page):
         assert module or site.defines(file.relative_to(ROOT).as_posix(), name), f"{link}: {name}"
 
 
+def test_modules_that_pages_link_to_have_a_page():
+    """Programs of packages (`__main__.py`) too."""
+    made = site.api_pages()
+    linked = {
+        file
+        for page in (ROOT / "docs").rglob("*.md")
+        for file in site.linked(page.read_text(), page.relative_to(ROOT).as_posix())
+        if file.startswith("roge_jax/") and file.endswith(".py")
+    }
+    missing = sorted(file for file in linked if site.api_page(file) not in made)
+    assert len(linked) > 50 and not missing, missing
+
+
 def test_a_folder_in_the_navigation_is_its_pages_in_order():
     start = site.shelf("start/")
     assert start[:3] == [f"start/{name}.md" for name in site.ORDER["start"]]
