@@ -9,6 +9,7 @@ import numpy as np
 import published_files as made
 import pytest
 from PIL import Image
+from run_files import PREVIEW_ALONE
 from scene_files import nerfstudio, truth
 
 import roge_jax as rj
@@ -144,16 +145,7 @@ def test_sample_makes_the_picture_and_says_so(place, capsys):
     out = place / "out"
     words = ["--checkpoint", place / "lager", "--scene", place / "scene", "--size", SIZE]
     assert run(sample, *words, "--trajectory", "orbit", "--frames", 3, "--out", out) == 0
-    names = sorted(p.name for p in out.iterdir())
-    assert names == [
-        "contact_sheet.png",
-        "frames",
-        "images",
-        "run.json",
-        "sparse",
-        "transforms.json",
-        "video.mp4",
-    ]
+    assert sorted(p.name for p in out.iterdir()) == PREVIEW_ALONE
     record = json.loads((out / "run.json").read_text())
     assert record["generated"] is False and record["size"] == [48, 64]
     assert record["seconds_per_frame"] == pytest.approx(

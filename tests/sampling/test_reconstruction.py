@@ -6,6 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
+from run_files import PREVIEW_ALONE
 from scene_files import HEIGHT, WIDTH, nerfstudio, truth
 from test_stretches import photos, weights  # noqa: F401  fixtures: the tiny model, two photos
 
@@ -102,16 +103,7 @@ def test_the_program_loads_and_runs_no_generator(place, monkeypatch):
     out = place / "out"
     assert program(place, "--trajectory", "orbit", "--frames", 7, "--out", out) == 0
     assert seen == [{"encoder", "renderer"}]
-    names = sorted(p.name for p in out.iterdir())
-    assert names == [
-        "contact_sheet.png",
-        "frames",
-        "images",
-        "run.json",
-        "sparse",
-        "transforms.json",
-        "video.mp4",
-    ]
+    assert sorted(p.name for p in out.iterdir()) == PREVIEW_ALONE
     assert len(video_io.read_video(out / "video.mp4")) == 7
     run = json.loads((out / "run.json").read_text())
     assert run["generated"] is False and run["evaluations"] == 0
