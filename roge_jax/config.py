@@ -118,6 +118,8 @@ class FlowConfig:
     solver: str = "euler"  # as the published models are sampled
     steps: int = 50
     schedule: str = "shift"
+    # Whether a video is generated unless that is asked for: not if the preview is better (docs/results/model_card.md).
+    generate: bool = True
 
 
 @dataclass(frozen=True)
@@ -308,7 +310,9 @@ def _mini() -> RoGeConfig:
         fusion=FusionConfig(geometry_channels=128, preview=True),
         # What the preview leaves open is small: it is decided at low noise levels, and those must not be rare.
         # Few steps end between the preview and the exact solution, which is less close to the truth (docs/results/solvers.md).
-        flow=FlowConfig(shift=1.0, weighting="uniform", steps=2, schedule="uniform"),
+        flow=FlowConfig(
+            shift=1.0, weighting="uniform", steps=2, schedule="uniform", generate=False
+        ),
         lora=LoraConfig(dit_rank=8, recon_rank=8),
     )
 

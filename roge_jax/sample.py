@@ -89,6 +89,11 @@ def parser() -> argparse.ArgumentParser:
     option("--path-frame", frame_help, metavar="WHERE")
     preview_help = "the reconstruction's own picture alone: no generator runs or is loaded, video and frames are the preview"
     p.add_argument("--preview-only", action="store_true", help=preview_help)
+    generate_help = (
+        "run the generator, also of a model whose preview is better than what it generates (mini); any option of the "
+        "generator asks for it too"
+    )
+    p.add_argument("--generate", action="store_true", help=generate_help)
     option("--start", "the context photo a preset path starts from", 0, type=number(0))
     option("--fov", "vertical field of view in degrees; the photos' if not given", type=real)
     option("--size", "HEIGHTxWIDTH of the pictures; the model's own if not given")
@@ -149,7 +154,7 @@ def main(args: argparse.Namespace) -> None:
 
         return print(describe())
     if args.preview_only:
-        check_options(args, "--preview-only runs none")
+        refuse_options(args, "--preview-only runs none")
     settings = sampling.Settings(
         steps=args.steps or 0,
         solver=args.solver or "",
@@ -158,6 +163,7 @@ def main(args: argparse.Namespace) -> None:
         slots=args.context_slots,
         long=args.long,
         scale=args.scale,
+        generate=True if args.generate or generator_option(args) else None,
     )
     if args.dry_run:
         with target.use(args.target):
@@ -166,7 +172,8 @@ def main(args: argparse.Namespace) -> None:
         raise UserError("--target and --compile belong to --dry-run: add it, or leave them out.")
     clock = Clock()
     config, mesh = model_config(args, weights=True), sampling_mesh(args)
-    settings, only = settings.of(config), previews(args, config)
+    settings = settings.of(config)
+    only = previews(args, config, settings)
     with output_folder(args.out, keep=outputs.FRAMES) as folder, sharding.use(mesh):
         with clock("load"):
             scene, photos, path = read_inputs(args, config, settings)
@@ -176,7 +183,7 @@ def main(args: argparse.Namespace) -> None:
             )
             params, _ = load_weights(args, mesh, reconstruction.PARTS if only else None)
         beside = Beside(scene, photos.ids, config, args.convention)
-        print(begun(args, scene, config, photos, path))
+        print(begun(args, scene, config, photos, path, only=only))
         plan = None
         if args.tolerance is not None or args.max_cost is not None:
             from .planning.plan import plan as make_plan
@@ -235,25 +242,34 @@ def main(args: argparse.Namespace) -> None:
     print(f"wrote {args.out}/ ({', '.join(videos)}, {rest})")
 
 
-def begun(args: argparse.Namespace, scene, config, photos, path) -> str:
-    """The first line of a run: what of which scene."""
+def begun(args: argparse.Namespace, scene, config, photos, path, *, only: bool) -> str:
+    """The first line of a run: what of which scene; `only`: nothing is generated."""
     count, (height, width) = len(photos.ids), config.output_size
     own = ", the built-in scene (--scene takes yours)" if args.scene == SCENE else ""
     many = "photo" if count == 1 else "photos"
-    return f"{count} {many} of {scene.source}{own}, {len(path)} frames of {height}x{width}, {config.name}"
+    how = ": the reconstruction's own picture" if only else ", generated"
+    if only and not (args.preview_only or config.parts == "reconstruction"):
+        how += ", which is better than what it generates (--generate)"
+    return f"{count} {many} of {scene.source}{own}, {len(path)} frames of {height}x{width}, {config.name}{how}"
 
 
-def previews(args: argparse.Namespace, config) -> bool:
-    """Whether nothing is generated: that was asked for, or there is nothing to generate with."""
+def previews(args: argparse.Namespace, config, settings) -> bool:
+    """Whether nothing is generated: that was asked for, there is nothing to generate with, or the preview is better."""
     if config.parts == "reconstruction":
-        check_options(args, f"{args.checkpoint} is a reconstruction alone")
-    return args.preview_only or config.parts == "reconstruction"
+        refuse_options(args, f"{args.checkpoint} is a reconstruction alone")
+    return args.preview_only or config.parts == "reconstruction" or not settings.generate
 
 
-def check_options(args: argparse.Namespace, why: str) -> None:
-    """Raise UserError for options of the generator, which does not run, and say `why`."""
+def refuse_options(args: argparse.Namespace, why: str) -> None:
+    """Raise UserError for an option of the generator, which does not run, and say `why`."""
     from .errors import UserError
 
+    if option := generator_option(args):
+        raise UserError(f"{option} is for the generator, and {why}: leave that option away.")
+
+
+def generator_option(args: argparse.Namespace) -> str | None:
+    """The first option given that only a generator has a use for, as it was written; None if there is none."""
     unused = parser()
     names = (
         "steps",
@@ -264,12 +280,14 @@ def check_options(args: argparse.Namespace, why: str) -> None:
         "long",
         "tolerance",
         "max_cost",
+        "generate",
+        "compile",
     )
-    for name in (*names, "compile"):
+    for name in names:
         value = getattr(args, name)
         if value != unused.get_default(name):
-            option = f"--{name.replace('_', '-')}" + (f" {value}" if value is not True else "")
-            raise UserError(f"{option} is for the generator, and {why}: leave that option away.")
+            return f"--{name.replace('_', '-')}" + (f" {value}" if value is not True else "")
+    return None
 
 
 def dry_run(args: argparse.Namespace, settings) -> str:
@@ -284,7 +302,8 @@ def dry_run(args: argparse.Namespace, settings) -> str:
         aot.by_the_cpu()
         aot.check(target.name())
     config, mesh = model_config(args, weights=False), sampling_mesh(args)
-    settings, notes, only = settings.of(config), [], previews(args, config)
+    settings, notes = settings.of(config), []
+    only = previews(args, config, settings)
     dtype = large_dtype(args, sum(cost.weight_bytes(config).values()) / 4)
     if mesh is not None:
         if target.fused(dtype) and not only:

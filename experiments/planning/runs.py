@@ -128,7 +128,7 @@ class Engine:
 
     def __init__(self, params, config):
         self.params, self.config = params, config
-        self.settings = sampling.Settings().of(config)
+        self.settings = sampling.Settings(generate=True).of(config)
         self.programs: dict = {}
         self.velocity = functools.partial(programs.velocity, slots="noised")
         self.decode = functools.partial(programs.decode, contexts=0)

@@ -52,7 +52,8 @@ def measure(seed: int, size: tuple[int, int], params, config, cache: dict) -> di
     photos = sampling.read_photos(scene, GIVEN, config)
     K = scale_K(scene.cameras.K, size, (config.height, config.width))
     path = Cameras(K, scene.cameras.c2w)
-    result = sampling.sample(params, config, photos, path, cache=cache)
+    settings = sampling.Settings(generate=True)
+    result = sampling.sample(params, config, photos, path, settings, cache=cache)
     rendered = np.stack([np.asarray(image) for image in scene.images])
     made = {"rendered": rendered, "generated": result.frames, "preview": result.preview}
     found = {}

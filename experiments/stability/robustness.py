@@ -193,7 +193,7 @@ class Runner:
     def __init__(self, name: str):
         self.params, self.config = checkpoint.load_model(name)
         self.programs: dict[int, programs.Programs] = {}
-        self.settings = sampling.Settings().of(self.config)
+        self.settings = sampling.Settings(generate=True).of(self.config)
 
     def videos(self, case: Case) -> dict[str, np.ndarray]:
         size = (self.config.height, self.config.width)

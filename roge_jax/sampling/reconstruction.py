@@ -10,6 +10,7 @@ a generator; `roge_jax.viewer` asks for one camera at a time.
 import dataclasses
 import functools
 from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -109,16 +110,37 @@ def of_photos(
 
 def encoder(params: Tree, views: model.Views, config: RoGeConfig) -> Callable:
     """(params, views) -> `Known`, compiled for these shapes."""
-    known = functools.partial(_known, config=config)
+    return _compiled(_encoding(params, views, config))[0]
+
+
+def both(
+    params: Tree, views: model.Views, count: int, config: RoGeConfig, photos: int | None = None
+) -> list[Callable]:
+    """[`encoder`, `compiled`] side by side: what the first picture waits for is their compilation."""
+    known = jax.eval_shape(functools.partial(_known, config=config), params, views)
+    looking = _looking(params, known, count, config, photos)
+    return _compiled(_encoding(params, views, config), looking)
+
+
+class _Program(NamedTuple):
+    """A jitted function and the shapes that it is to be compiled for."""
+
+    function: Any
+    shapes: tuple[Any, ...]
+
+
+def _compiled(*programs: _Program) -> list[Callable]:
+    """Compiled side by side. Tracing holds Python's lock, compiling does not."""
     if stepping():
-        return known
-    program = jax.jit(known)
-    return program.lower(*sharding.shapes((params, views))).compile()
+        return [program.function for program in programs]
+    lowered = [program.function.lower(*program.shapes) for program in programs]
+    with ThreadPoolExecutor(len(lowered)) as pool:
+        return list(pool.map(lambda low: low.compile(), lowered))
 
 
-def known_shapes(params: Tree, views: model.Views, config: RoGeConfig) -> Known:
-    """What `encoder` makes, abstractly: `compiled` need not wait for it."""
-    return jax.eval_shape(functools.partial(_known, config=config), params, views)
+def _encoding(params: Tree, views: model.Views, config: RoGeConfig) -> _Program:
+    known = functools.partial(_known, config=config)
+    return _Program(jax.jit(known), tuple(sharding.shapes((params, views))))
 
 
 def _known(params: Tree, views: model.Views, *, config: RoGeConfig) -> Known:
@@ -163,14 +185,18 @@ def compiled(
     params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None = None
 ) -> Callable:
     """`look` for `count` cameras: (params, known, K, c2w) -> pictures; with `photos`, how many, their numbers come last."""
+    return _compiled(_looking(params, known, count, config, photos))[0]
+
+
+def _looking(
+    params: Tree, known: Known, count: int, config: RoGeConfig, photos: int | None
+) -> _Program:
     shapes: list[Any] = [((count, n, n), jnp.float32) for n in (3, 4)]
     shapes += [] if photos is None else [((photos,), jnp.int32)]
-    if stepping():
-        return functools.partial(look, config=config)
     where = sharding.everywhere()
     cameras = (jax.ShapeDtypeStruct(shape, kind, sharding=where) for shape, kind in shapes)
-    program = jax.jit(functools.partial(look, config=config), out_shardings=sharding.everywhere())
-    return program.lower(*sharding.shapes((params, known)), *cameras).compile()
+    program = jax.jit(functools.partial(look, config=config), out_shardings=where)
+    return _Program(program, (*sharding.shapes((params, known)), *cameras))
 
 
 def preview(
@@ -195,14 +221,17 @@ def preview(
     stage = stage or (lambda name: nullcontext())
     cache = {} if cache is None else cache
     warned = limits.warn(photos.images, photos.cameras, path, config.name, photos.ids, known)
-    encoded, info = encode(params, config, photos, path, scale=scale, stage=stage, cache=cache)
+    views, info = of_photos(config, photos, path, scale=scale)
     targets = info.apply(path)
     length = at_once(config, len(path))
-    key = "look", length, _shapes(encoded)
+    key = "preview", length, _shapes(views)
     if key not in cache:
         with stage("compile"):
-            cache[key] = compiled(params, encoded, length, config)
-    run, frames = cache[key], []
+            cache[key] = both(params, views, length, config)
+    encoding, run = cache[key]
+    with stage("prepare"):
+        encoded = jax.block_until_ready(encoding(params, views))
+    frames = []
     bar: Any = progress
     if isinstance(progress, bool):
         bar = tqdm(desc="preview", unit="frame", disable=not progress, dynamic_ncols=True)

@@ -20,7 +20,8 @@ class Settings:
     """How to sample; all of it goes into run.json. Steps 0, no solver, no schedule: the model's own (`of`).
 
     A solver is a name or a function of one's own, `solvers.Sampler`. A schedule is a name or the noise levels
-    themselves, [steps + 1] from 1 down to 0.
+    themselves, [steps + 1] from 1 down to 0. A model may leave its video to the reconstruction (`FlowConfig.generate`):
+    then `generate`, or steps, a solver or a schedule, ask for the generator.
     """
 
     steps: int = 0
@@ -30,6 +31,7 @@ class Settings:
     slots: flow.ContextSlots = "noised"
     long: Literal["chain", "independent"] = "chain"
     scale: float | None = None  # divisor of all positions, in scene units; None: the model's rule
+    generate: bool | None = None  # False: the reconstruction's picture; None: as the model has it
 
     def __post_init__(self):
         named: list[tuple[str, Any, tuple[str, ...]]] = [
@@ -56,7 +58,10 @@ class Settings:
 
     def of(self, config: RoGeConfig) -> "Settings":
         """These settings with what they leave open as the model's configuration has it."""
-        own = config.flow
+        own, generate = config.flow, self.generate
+        if generate is None:
+            named = isinstance(self.schedule, str) and not self.schedule
+            generate = own.generate or bool(self.steps or self.solver) or not named
         if isinstance(self.schedule, str):
             schedule: Any = self.schedule or own.schedule
             steps = self.steps or own.steps
@@ -64,7 +69,11 @@ class Settings:
             schedule = tuple(float(sigma) for sigma in self.schedule)
             steps = len(schedule) - 1
         return dataclasses.replace(
-            self, steps=steps, solver=self.solver or own.solver, schedule=schedule
+            self,
+            steps=steps,
+            solver=self.solver or own.solver,
+            schedule=schedule,
+            generate=generate,
         )
 
     def names(self) -> tuple[str, str]:

@@ -113,7 +113,8 @@ def sample(
 ) -> Result:
     """The video along `path` (cameras [n] in the scene's frame, K in pixels of config.height x config.width).
 
-    Of a reconstruction alone it is `reconstruction.preview`; of the settings it takes the scale.
+    Of a reconstruction alone, or where `settings` do not ask for the generator of a model whose preview is better, it is
+    `reconstruction.preview`; of the settings it takes the scale.
 
     Args:
       stage: called with "compile", "prepare", "sample" and "decode"; a context manager that times (`entry.Clock`).
@@ -124,18 +125,18 @@ def sample(
     Raises: UserError for what cannot be done; `solvers.SamplingError` at the first number that is not finite.
     """
     stage = stage or (lambda name: nullcontext())
-    settings = settings or Settings()
+    settings = (settings or Settings()).of(config)
     cache = {} if cache is None else cache
-    if config.parts != "all":
+    if config.parts != "all" and plan is not None:
+        raise UserError(NOTHING_TO_PLAN)
+    if config.parts != "all" or not (settings.generate or plan):
         from . import reconstruction  # it imports this module, and refuses a generator alone
 
-        if plan is not None:
-            raise UserError(NOTHING_TO_PLAN)
         show = functools.partial(
             reconstruction.preview, stage=stage, progress=progress, cache=cache, known=known
         )
         return show(params, config, photos, path, scale=settings.scale)
-    given, unplanned, settings = len(photos.ids), config, settings.of(config)
+    given, unplanned = len(photos.ids), config
     check_photos(photos, config)
     if plan is not None:
         if tuple(plan.ids) != tuple(photos.ids):

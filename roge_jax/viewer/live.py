@@ -3,7 +3,6 @@
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -73,17 +72,13 @@ class Live:
         self.ready[level] = True
 
     def _build_both(self, level: int, key: tuple[int, int]) -> None:
-        """Encoding and program side by side: what the first picture waits for is their compilation."""
+        """Encode the scene and compile the level's program."""
         config, params = self.levels[level].config, self.params
         whole = key == recon_size(self.config)
         photos = self.photos if whole else read_photos(self.scene, self.ids, config)
         views, info = reconstruction.of_photos(config, photos, self.near, scale=self.scale)
-        shapes = reconstruction.known_shapes(params, views, config)
-        with ThreadPoolExecutor(1) as pool:
-            run = pool.submit(reconstruction.compiled, params, shapes, 1, config, self._few(level))
-            known = reconstruction.encoder(params, views, config)(params, views)
-            self._known[key] = jax.block_until_ready(known), info
-            self._run[level] = run.result()
+        encoding, self._run[level] = reconstruction.both(params, views, 1, config, self._few(level))
+        self._known[key] = jax.block_until_ready(encoding(params, views)), info
 
     def picture(self, level: int, view: View) -> np.ndarray:
         """What a viewer sees, uint8 [h, w, 3]; the time it took is kept in `pace`."""

@@ -197,7 +197,9 @@ class Session:
             given = self.given
             if generated and given.config.parts == "reconstruction":
                 raise UserError("This model is a reconstruction alone: make a preview.")
-            settings = sampling.Settings(steps=steps, seed=seed, scale=given.scale).of(given.config)
+            settings = sampling.Settings(
+                steps=steps, seed=seed, scale=given.scale, generate=generated
+            ).of(given.config)
             path, of = self.path(), self.route
             count = 0
             if generated:

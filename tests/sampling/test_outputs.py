@@ -390,7 +390,7 @@ def test_the_built_in_scene_is_no_reason_to_warn(place, capsys):
     assert (
         first
         == "2 photos of motorcycle, the built-in scene (--scene takes yours), 6 frames of "
-        + (f"{SIZE[0]}x{SIZE[1]}, tiny")
+        + (f"{SIZE[0]}x{SIZE[1]}, tiny: the reconstruction's own picture")
     )
 
 

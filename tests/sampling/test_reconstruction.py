@@ -16,7 +16,7 @@ from roge_jax.files import entry, video_io
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import PRESETS, make_path, preset_options
 from roge_jax.sampling import reconstruction
-from roge_jax.scenes.scene import Scene
+from roge_jax.scenes.scene import Scene, load_scene
 
 CONFIG = preset("tiny")
 INDEPENDENT = sampling.Settings(steps=1, solver="euler", schedule="uniform", long="independent")
@@ -119,6 +119,57 @@ def test_options_of_the_generator_are_refused(place, capsys, words):
     said = capsys.readouterr().err
     assert f"{words[0]} {words[1]}" in said and "--preview-only" in said
     assert not (place / "never").exists()
+
+
+# ---- models whose preview is better than what they generate ---------------------------------------
+
+
+@pytest.fixture(scope="module")
+def cautious(place, weights):  # noqa: F811
+    """`place` with a model of the same weights that generates only if asked."""
+    own = dataclasses.replace(CONFIG, flow=dataclasses.replace(CONFIG.flow, generate=False))
+    checkpoint.save_model(place / "cautious", weights, own, dtype=np.float32)
+    return own
+
+
+@pytest.mark.parametrize(
+    ("words", "generated"),
+    [
+        ((), False),
+        (("--scale", 2.0), False),
+        (("--generate",), True),
+        (("--steps", 2), True),
+        (("--seed", 1), True),
+        (("--preview-only",), False),
+    ],
+)
+def test_generates_only_if_asked(place, cautious, capsys, words, generated):
+    """`--generate` or any option of the generator asks; the dry run counts the same."""
+    given = ["--checkpoint", place / "cautious", "--scene", place / "scene", *words, "--dry-run"]
+    assert entry.execute(sample.main, sample.parser(), [str(word) for word in given]) == 0
+    assert ("velocity" in capsys.readouterr().out) is generated
+
+
+def test_the_video_of_a_cautious_model_is_its_preview(place, cautious, weights, capsys):  # noqa: F811
+    given = ["--checkpoint", place / "cautious", "--scene", place / "scene", "--frames", 5]
+    given += ["--out", place / "own"]
+    assert entry.execute(sample.main, sample.parser(), [str(word) for word in given]) == 0
+    said = capsys.readouterr().out
+    assert said.splitlines()[0].endswith("better than what it generates (--generate)")
+    assert json.loads((place / "own" / "run.json").read_text())["generated"] is False
+
+    two = sampling.read_photos(load_scene(place / "scene"), [0, 1], cautious)
+    path = make_path("orbit", two.cameras, 5)
+    shown = sampling.preview(weights, cautious, two, path)
+    made = sampling.sample(weights, cautious, two, path, sampling.Settings(seed=3))
+    assert made.evaluations == 0
+    np.testing.assert_array_equal(made.frames, shown.frames)
+    for settings in (sampling.Settings(steps=1), sampling.Settings(generate=True)):
+        made = sampling.sample(weights, cautious, two, path, settings)
+        assert made.evaluations == settings.of(cautious).steps
+        assert np.abs(made.frames - shown.frames).max() > 1e-3
+    none = sampling.Settings(steps=1, generate=False)
+    assert sampling.sample(weights, cautious, two, path, none).evaluations == 0
 
 
 def test_a_dry_run_counts_what_runs(place, capsys):

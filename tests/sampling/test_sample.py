@@ -328,9 +328,11 @@ def test_a_window_is_what_training_shows_the_networks(weights, photos, rule, m, 
 def test_what_settings_leave_open_is_the_models_own(weights, photos):
     own = dataclasses.replace(CONFIG.flow, solver="midpoint", steps=3, schedule="graded")
     theirs = dataclasses.replace(CONFIG, flow=own)
-    assert sampling.Settings(seed=4).of(theirs) == sampling.Settings(3, "midpoint", "graded", 4)
+    assert sampling.Settings(seed=4).of(theirs) == sampling.Settings(
+        3, "midpoint", "graded", 4, generate=True
+    )
     assert sampling.Settings(2, "euler", "shift").of(theirs) == sampling.Settings(
-        2, "euler", "shift"
+        2, "euler", "shift", generate=True
     )
     path = make_path("orbit", photos.cameras, 1)
     for settings, evaluations in ((sampling.Settings(), 6), (sampling.Settings(steps=1), 2)):
@@ -596,7 +598,10 @@ def test_dry_run_of_presets_needs_no_weights(name, said, tmp_path, capsys):
         entry.execute(
             sample.main,
             sample.parser(),
-            ["--checkpoint", name, "--context", "2", "--dry-run", "--out", str(tmp_path / "o")],
+            [
+                *("--checkpoint", name, "--context", "2", "--generate"),
+                *("--dry-run", "--out", str(tmp_path / "o")),
+            ],
         )
         == 0
     )

@@ -159,7 +159,7 @@ class TestFlags:
 
     def test_the_dry_run_tells_what_each_device_holds(self, capsys):
         def note(*words):
-            arguments = ["--dry-run", "--dtype", "bfloat16", *words]
+            arguments = ["--generate", "--dry-run", "--dtype", "bfloat16", *words]
             assert entry.execute(sample.main, sample.parser(), arguments) in (0, None)
             found = re.search(r"each device holds ([0-9.]+) MB", capsys.readouterr().out)
             return float(found[1])
