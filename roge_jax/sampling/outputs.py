@@ -13,6 +13,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..config import RoGeConfig, to_dict
 from ..files import video_io
 from ..files.entry import Clock, environment, version
@@ -75,17 +77,17 @@ def write_outputs(
 ) -> None:
     """All files but run.json. Where nothing is generated the frames are the preview, which is not written twice."""
     names = video_io.write_frames(folder / FRAMES, result.frames, about=about)
-    write_scene(folder, names, result, scene, photos, about=about, fps=fps)
+    given = write_scene(folder, names, result, scene, photos, about=about, fps=fps)
     if exr:
         write_floats(folder / "exr", result, about=about)
     for kind in kinds:
         video_io.write_video(folder / f"video.{kind}", result.frames, fps, about=about)
-    rows: dict[str, Any] = {"photos": photos.images}
+    rows: dict[str, Any] = {"photos": given}
     if generated:
         for kind in kinds:
             video_io.write_video(folder / f"preview.{kind}", result.preview, fps, about=about)
         rows["generated"] = result.frames
-    rows["preview (reconstruction)"] = result.preview
+    rows["preview (reconstruction)" if generated else "video (reconstruction)"] = result.preview
     sheet = video_io.contact_sheet(rows)
     video_io.write_png(folder / "contact_sheet.png", sheet, about=about)
 
@@ -109,10 +111,11 @@ def write_scene(
     *,
     about: str | None,
     fps: float,
-) -> None:
+) -> np.ndarray:
     """Frames and photos as one scene: images/, transforms.json (nerfstudio), sparse/0 (COLMAP, with the scene's points).
 
-    The photos come last, cut as the frames are. A path file made of it is the frames' alone (`path_frames`).
+    The photos come last, cut as the frames are: [m, H, W, 3], which are returned. A path file made of it is the frames'
+    alone (`path_frames`).
     """
     (height, width), names = result.frames.shape[1:3], list(names)
     (folder / IMAGES).mkdir()
@@ -128,6 +131,7 @@ def write_scene(
     said = json.loads(about) if about else {}
     content |= {"fps": fps, "roge_jax": {**said, "path_frames": len(result.frames)}}
     write_json(folder / "transforms.json", content)
+    return pictures
 
 
 def write_model(

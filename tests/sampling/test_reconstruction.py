@@ -16,6 +16,7 @@ from roge_jax.files import entry, video_io
 from roge_jax.geometry.cameras import Cameras
 from roge_jax.geometry.trajectories import PRESETS, make_path, preset_options
 from roge_jax.sampling import reconstruction
+from roge_jax.scenes.images import read_image
 from roge_jax.scenes.scene import Scene, load_scene
 
 CONFIG = preset("tiny")
@@ -109,6 +110,12 @@ def test_the_program_loads_and_runs_no_generator(place, monkeypatch):
     assert run["generated"] is False and run["evaluations"] == 0
     assert run["settings"] == {"scale": None}
     assert run["windows"][0]["rgb_head"] == [[0, 6]]
+    # The sheet shows the photos as large as the frames.
+    photo = read_image(out / "images" / "photo00.png")
+    sheet = read_image(out / "contact_sheet.png")
+    times = -(-96 // len(photo))
+    photo = photo.repeat(times, 0).repeat(times, 1)
+    np.testing.assert_array_equal(sheet[24:][: photo.shape[0], 4:][:, : photo.shape[1]], photo)
 
 
 @pytest.mark.parametrize(
