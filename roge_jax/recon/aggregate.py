@@ -2,7 +2,8 @@
 
 The look-up decides cell by cell (`recon.lookup`), and where neighbours disagree its cuts jump from pixel to pixel. Here
 every pixel has a cost for each cut, from how well the photos match there (`recon.matching`) and what the network
-believes, and cuts of neighbours that differ cost as well (Hirschmueller 2008, four directions). Nothing in here is trained.
+believes, and cuts of neighbours that differ cost as well (Hirschmueller 2008, four or eight directions). Nothing in here is
+trained.
 """
 
 import jax
@@ -39,10 +40,13 @@ def box(x: jax.Array, radius: int) -> jax.Array:
     return x
 
 
-def semi_global(cost: jax.Array, guide: jax.Array | None = None) -> jax.Array:
+def semi_global(
+    cost: jax.Array, guide: jax.Array | None = None, *, diagonals: bool = False
+) -> jax.Array:
     """Costs [k, h, w] of cuts with those of the neighbours along both axes, both ways.
 
-    guide: [h, w, 3] the picture that they are of; where its colours change, cuts may jump for less.
+    guide: [h, w, 3] the picture that they are of; where its colours change, cuts may jump for less. diagonals: along those
+    as well, for twice the time: without a guide what nothing is known of has rectangular borders otherwise.
     """
 
     def along(cost: jax.Array, jump: jax.Array, reverse: bool) -> jax.Array:
@@ -69,9 +73,33 @@ def semi_global(cost: jax.Array, guide: jax.Array | None = None) -> jax.Array:
             first, last = jump.at[:, 1:].set(cheaper), jump.at[:, :-1].set(cheaper)
         return along(cost, first, False) + along(cost, last, True)
 
-    turned = None if guide is None else jnp.swapaxes(guide, 0, 1)
-    down = both_ways(jnp.swapaxes(cost, 1, 2), turned)
-    return (both_ways(cost, guide) + jnp.swapaxes(down, 1, 2)) / 4
+    def down(cost: jax.Array, guide: jax.Array | None) -> jax.Array:
+        turned = None if guide is None else jnp.swapaxes(guide, 0, 1)
+        return jnp.swapaxes(both_ways(jnp.swapaxes(cost, 1, 2), turned), 1, 2)
+
+    total = both_ways(cost, guide) + down(cost, guide)
+    if not diagonals:
+        return total / 4
+    assert guide is None, "a guide is not skewed"
+    w = cost.shape[2]
+    falling = skewed(cost[..., ::-1])  # its columns are the diagonals of the mirrored pixels
+    total = total + straightened(down(skewed(cost), None), w)
+    return (total + straightened(down(falling, None), w)[..., ::-1]) / 8
+
+
+def skewed(x: jax.Array) -> jax.Array:
+    """[.., h, w] -> [.., h, w + h - 1], row y moved right by y, zeros beside it: columns are diagonals."""
+    h, w = x.shape[-2:]
+    x = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, h)]).reshape(*x.shape[:-2], h * (w + h))
+    return x[..., : h * (w + h - 1)].reshape(*x.shape[:-1], h, w + h - 1)
+
+
+def straightened(x: jax.Array, w: int) -> jax.Array:
+    """The inverse of `skewed`: [.., h, w + h - 1] -> [.., h, w]."""
+    h = x.shape[-2]
+    x = x.reshape(*x.shape[:-2], -1)
+    x = jnp.pad(x, [(0, 0)] * (x.ndim - 1) + [(0, h)])
+    return x.reshape(*x.shape[:-1], h, w + h)[..., :w]
 
 
 def cheapest(cost: jax.Array) -> jax.Array:

@@ -45,11 +45,13 @@ def surfaces(
         evidence, seen = evidence.reshape(-1, h, w), seen.reshape(-1, h, w)
         return with_belief(evidence, seen, belief)
 
-    cut = cheapest(semi_global(costs(all_cuts(cuts, h * w, reach), h, w, belief)))
+    coarse = costs(all_cuts(cuts, h * w, reach), h, w, belief)
+    cut = cheapest(semi_global(coarse, diagonals=True))
     about = About.of(cut, cuts, reach, (FINER * h, FINER * w))
     fine = costs(about.inverse.reshape(LABELS, -1), FINER * h, FINER * w, None) + about.cost
     steps = occupied(inverse_depth(cut, cuts, reach), cuts)
-    return Surfaces(about.at(cheapest(semi_global(fine))), steps[1] - steps[0])
+    found = about.at(cheapest(semi_global(fine, diagonals=True)))
+    return Surfaces(found, steps[1] - steps[0])
 
 
 def blocked(depths: Depths, way: Motion, where: jax.Array, inverse: jax.Array) -> jax.Array:

@@ -45,6 +45,35 @@ def test_semi_global_costs_are_those_of_the_best_path():
         np.testing.assert_allclose(through[:, x] - path[x], np.array(forced) - best, atol=1e-5)
 
 
+def path_by_path(cost: np.ndarray, directions: list[tuple[int, int]]) -> np.ndarray:
+    """Semi-global aggregation as the paper writes it: every pixel asks the one before it, direction by direction."""
+    k, h, w = cost.shape
+    total = np.zeros_like(cost)
+    for dy, dx in directions:
+        along = np.zeros_like(cost)
+        for y in range(h) if dy >= 0 else reversed(range(h)):
+            for x in range(w) if dx >= 0 else reversed(range(w)):
+                along[:, y, x] = cost[:, y, x]
+                if 0 <= y - dy < h and 0 <= x - dx < w:
+                    before = along[:, y - dy, x - dx]
+                    near = np.full((2, k), np.inf)
+                    near[0, 1:], near[1, :-1] = before[:-1], before[1:]
+                    least = before.min()
+                    ways = [before, *(near + aggregate.STEP), np.full(k, least + aggregate.JUMP)]
+                    along[:, y, x] += np.min(ways, 0) - least
+        total += along
+    return total / len(directions)
+
+
+@pytest.mark.parametrize("diagonals", [False, True])
+def test_semi_global_is_the_mean_over_its_directions(diagonals):
+    cost = 8.0 * RNG.random((5, 6, 9))
+    around = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    used = [(y, x) for y, x in around if abs(y) + abs(x) == 1 or (diagonals and y and x)]
+    found = aggregate.semi_global(np.asarray(cost), diagonals=diagonals)
+    np.testing.assert_allclose(found, path_by_path(cost, used), atol=1e-5)
+
+
 def test_a_lone_outlier_follows_its_neighbours_and_an_edge_stays():
     cost = np.full((8, 12, 16), 0.2, np.float32)
     truth = np.where(np.arange(16) < 8, 2, 6)[None].repeat(12, 0)
