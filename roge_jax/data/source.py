@@ -2,8 +2,23 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from ..errors import UserError
 from .dataset import read_dataset
+
+
+class Chosen:
+    """Some sequences of a dataset: item i is its item rows[i]."""
+
+    def __init__(self, dataset, rows):
+        self.dataset, self.rows = dataset, rows
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __getitem__(self, index: int) -> dict:
+        return self.dataset[int(self.rows[index])]
 
 
 class ProceduralSource:
@@ -32,7 +47,7 @@ def open_source(folder: Path | None, height: int, width: int, window: int, depth
     """Sequences to draw training samples of `window` targets at height x width from: the dataset in `folder`, or
     procedural ones.
 
-    With `depth`, sequences have it.
+    With `depth`, sequences have it. Those shorter than the window are not drawn.
 
     Raises:
         UserError: the dataset has no depth, or its frames are not that size or a whole multiple of it, or are fewer than the window.
@@ -44,7 +59,8 @@ def open_source(folder: Path | None, height: int, width: int, window: int, depth
         raise UserError(
             f"{folder}: its scenes have no depth, which this stage learns from: render the dataset with --depth."
         )
-    frames, h, w = found[0]["rgb"].shape[:3]
+    h, w = found[0]["rgb"].shape[1:3]
+    frames = int(found.lengths.max())
     if h % height or w % width or h // height != w // width:
         raise UserError(
             f"{folder}: its frames are {h}x{w} and this stage trains at {height}x{width}: give a dataset of that size or "
@@ -55,4 +71,5 @@ def open_source(folder: Path | None, height: int, width: int, window: int, depth
             f"{folder}: its sequences have {frames} frames and this stage trains on chunks of {window}: render or "
             f"pack longer ones with --frames."
         )
-    return found
+    rows = np.flatnonzero(found.lengths >= window)
+    return found if len(rows) == len(found) else Chosen(found, rows)

@@ -27,7 +27,8 @@ PUT_BACK = "put it back and continue with --resume, nothing that was trained is 
 def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
     """The sequences of a stage. Raises: UserError if the dataset does not have its size or frames."""
     working = stage_config(config, stage)
-    window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
+    video = stage.views.ordered or stage.objective == "vae"
+    window = working.frames if video else max(stage.views.contexts) + 1
     try:
         return open_source(pool, working.height, working.width, window, stage.views.depth)
     except UserError as error:
