@@ -60,9 +60,11 @@ def with_grain(batches: Callable[[int], dict], count: int, processes: int) -> It
     from absl import flags
 
     flags.FLAGS.mark_as_parsed()  # grain's workers refuse to start before
-    options = grain.MultiprocessingOptions(num_workers=processes, per_worker_buffer_size=2)
+    options = grain.MultiprocessingOptions(num_workers=processes, per_worker_buffer_size=1)
     dataset = grain.MapDataset.range(count).map(batches)
-    return iter(dataset.to_iter_dataset().mp_prefetch(options))
+    # By default each process has 16 threads and up to 500 batches ready: tens of gigabytes at this size.
+    reading = grain.ReadOptions(num_threads=1, prefetch_buffer_size=1)
+    return iter(dataset.to_iter_dataset(reading).mp_prefetch(options))
 
 
 def ways(batches: Callable[[int], dict], count: int) -> dict[str, Callable[[], Iterator[dict]]]:
@@ -161,8 +163,8 @@ def main() -> None:
     p.add_argument("--size", default="192x336", help="HEIGHTxWIDTH (default: 192x336)")
     p.add_argument("--frames", type=int, default=81, help="of a sample (default: 81)")
     p.add_argument("--batch", type=int, default=1, help="scenes a step (default: 1)")
-    p.add_argument("--steps", type=int, default=8, help="batches of each way (default: 8)")
-    p.add_argument("--step", type=float, default=1.5, help="seconds of a step (default: 1.5)")
+    p.add_argument("--steps", type=int, default=6, help="batches of each way (default: 6)")
+    p.add_argument("--step", type=float, default=1.0, help="seconds of a step (default: 1)")
     p.add_argument("--out", type=Path, default=harness.RESULTS / "loading.json")
     args = p.parse_args()
     height, width = (int(x) for x in args.size.split("x"))

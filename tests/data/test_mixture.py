@@ -5,9 +5,8 @@ import time
 
 import numpy as np
 import pytest
-from train_runs import losses, run, same, write_dataset
+from train_runs import run, write_dataset
 
-from roge_jax.checkpoint import load_model
 from roge_jax.data.source import Given, Mixture, as_given, given, open_mixture, open_source
 from roge_jax.data.views import ViewConfig, draw_batch
 from roge_jax.errors import UserError
@@ -103,8 +102,8 @@ def test_batches_of_many_threads_come_in_order():
     assert [x["i"] for x in prefetched(slow, 2, 20, loaders=4)] == list(range(2, 20))
 
 
-def test_a_run_on_two_datasets_resumes_exactly(tmp_path, common, cheap, capsys):
-    """Interrupted after a step and gone on with three threads, with a bad sequence: the same model."""
+def test_a_run_on_two_datasets_says_what_it_used(tmp_path, common, cheap):
+    """And is not continued on others."""
     from roge_jax import config
 
     tiny = config.PRESETS["tiny"]()
@@ -112,28 +111,13 @@ def test_a_run_on_two_datasets_resumes_exactly(tmp_path, common, cheap, capsys):
     folders = [write_dataset(tmp_path / n, size, k, 2 * tiny.frames) for k, n in enumerate("ab")]
     spoil(folders[0], 0)
     words = [*common, "--data", f"{folders[0]}:2", "--data", folders[1], "--batch", 2]
-    run(*words, "--steps", 3, "--out", tmp_path / "one")
-    run(*words, "--steps", 1, "--out", tmp_path / "two")
-    run(*words, "--steps", 3, "--out", tmp_path / "two", "--loaders", 3, "--resume")
-    assert losses(tmp_path / "one" / "lora") == losses(tmp_path / "two" / "lora")
-    models = [load_model(tmp_path / name / "lora" / "model")[0] for name in ("one", "two")]
-    assert same(*models)
-    settings = json.loads((tmp_path / "one" / "lora" / "settings.json").read_text())
+    run(*words, "--steps", 2, "--out", tmp_path, "--loaders", 3)
+    settings = json.loads((tmp_path / "lora" / "settings.json").read_text())
     assert settings["data"] == f"{folders[0]}:2, {folders[1]}"
     assert settings["data contents"].count(":") == 2
-    assert (tmp_path / "one" / "lora" / "passed_over.jsonl").exists()
-    rows = (tmp_path / "one" / "lora" / "log.jsonl").read_text().splitlines()
-    assert all(0 <= json.loads(row)["waiting"] <= 1 for row in rows)
+    assert (tmp_path / "lora" / "passed_over.jsonl").exists()
+    rows = (tmp_path / "lora" / "log.jsonl").read_text().splitlines()
+    assert len(rows) == 2 and all(0 <= json.loads(row)["waiting"] <= 1 for row in rows)
+    words = [*common, "--data", folders[1], "--batch", 2, "--steps", 3, "--out", tmp_path]
     with pytest.raises(UserError, match="holds a run with data contents"):
-        run(
-            *common,
-            "--data",
-            folders[1],
-            "--batch",
-            2,
-            "--steps",
-            5,
-            "--out",
-            tmp_path / "one",
-            "--resume",
-        )
+        run(*words, "--resume")
