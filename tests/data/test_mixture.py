@@ -109,7 +109,7 @@ def test_a_run_on_two_datasets_says_what_it_used(tmp_path, common, cheap):
     tiny = config.PRESETS["tiny"]()
     size = (tiny.height, tiny.width)
     folders = [write_dataset(tmp_path / n, size, k, 2 * tiny.frames) for k, n in enumerate("ab")]
-    spoil(folders[0], 0)
+    spoil(folders[0], [0, 1])
     words = [*common, "--data", f"{folders[0]}:2", "--data", folders[1], "--batch", 2]
     run(*words, "--steps", 2, "--out", tmp_path, "--loaders", 3)
     settings = json.loads((tmp_path / "lora" / "settings.json").read_text())
