@@ -8,6 +8,10 @@ class UserError(ValueError):
     """A mistake in the input. Entry points print its one sentence and exit with code 2."""
 
 
+class UnsafeFile(UserError):
+    """A file that tries to execute code. A whole run stops for it: whoever made it may have made the others."""
+
+
 class OutputError(RuntimeError):
     """What was computed could not be written whole. Its one sentence says what stays, where, and how to go on; exit code 1."""
 

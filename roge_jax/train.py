@@ -41,8 +41,20 @@ def parser() -> argparse.ArgumentParser:
     )
     p.add_argument(
         "--data",
-        type=Path,
-        help="dataset, a folder written by roge_jax.procedural or data.pack (default: render as we go)",
+        action="append",
+        metavar="DIR[:WEIGHT]",
+        help="dataset, a folder written by roge_jax.procedural or data.pack (default: render as we go); may be given\n"
+        "several times, and is then drawn from as often as its weight says (1 without)",
+    )
+    p.add_argument(
+        "--most-bad",
+        type=number(0),
+        default=100,
+        help="sequences of the data that may be unusable before the run stops; they are passed over and listed in\n"
+        "OUT/STAGE/passed_over.jsonl (default: 100)",
+    )
+    p.add_argument(
+        "--loaders", type=number(1), default=1, help="threads that draw batches (default: 1)"
     )
     p.add_argument(
         "--out", type=Path, default=Path("runs/train"), help="output folder (default: runs/train)"

@@ -29,7 +29,8 @@ ALLOWED = {
     "weights": _PARTS,
     "procedural": _BASE,
     "scenes": _BASE | {"procedural"},
-    "data": _BASE | {"procedural", "scenes"},  # neither networks nor metrics
+    # Neither networks nor metrics; of weights the reader of PyTorch's files alone.
+    "data": _BASE | {"procedural", "scenes", "weights"},
     "posing": _BASE | {"scenes"},
     "metrics": _BASE,
     "checkpoint": _PARTS | {"model", "weights"},

@@ -2,7 +2,8 @@
 
 A dataset is a folder of shards. Shard k is `shard_00000.rgb.npy` (uint8 `[scenes,f,h,w,3]`),
 `shard_00000.depth.npy` (float16, optional) and `shard_00000.npz` (`seeds [scenes]`, `K` and `c2w`
-float64 `[scenes,f,...]`). The .npz is renamed into place last, so a shard with one is complete.
+float64 `[scenes,f,...]`; `lengths [scenes]` where some have fewer than f frames, and zeros behind them).
+The .npz is renamed into place last, so a shard with one is complete.
 """
 
 import concurrent.futures
@@ -34,7 +35,7 @@ __getattr__ = renamed(
 class Dataset:
     """The finished shards of a dataset; `dataset[i]` is one scene, its frames still on disk.
 
-    `seeds [n]`, `K [n,f,3,3]`, `c2w [n,f,4,4]` (OpenCV, float64) are in memory; `rgb` and `depth`
+    `seeds [n]`, `lengths [n]`, `K [n,f,3,3]`, `c2w [n,f,4,4]` (OpenCV, float64) are in memory; `rgb` and `depth`
     are one memory map per shard.
     """
 
@@ -44,6 +45,7 @@ class Dataset:
     K: np.ndarray
     c2w: np.ndarray
     starts: np.ndarray
+    lengths: np.ndarray
 
     def __len__(self) -> int:
         return len(self.seeds)
@@ -54,9 +56,14 @@ class Dataset:
             raise IndexError(index)
         shard = int(np.searchsorted(self.starts, index, side="right")) - 1
         row = index - int(self.starts[shard])
-        scene = {"rgb": self.rgb[shard][row], "K": self.K[index], "c2w": self.c2w[index]}
+        f = int(self.lengths[index])
+        scene = {
+            "rgb": self.rgb[shard][row, :f],
+            "K": self.K[index, :f],
+            "c2w": self.c2w[index, :f],
+        }
         scene["seed"] = self.seeds[index]
-        return scene | {"depth": self.depth[shard][row]} if self.depth else scene
+        return scene | {"depth": self.depth[shard][row, :f]} if self.depth else scene
 
 
 def write_dataset(
@@ -106,12 +113,12 @@ def write_dataset(
         folder_pictures(textures, split_of(int(wanted[0])))  # says what is wrong with the folder
         settings["textures"] = str(textures)
     path.mkdir(parents=True, exist_ok=True)
-    with _sole_writer(path):
+    with sole_writer(path):
         _write_missing(path, wanted, settings, processes)
 
 
 @contextlib.contextmanager
-def _sole_writer(path: Path) -> Iterator[None]:
+def sole_writer(path: Path) -> Iterator[None]:
     """Hold the folder's lock: two writers would truncate each other's unfinished shards.
 
     The system drops the lock when its process ends, however it ends.
@@ -138,20 +145,25 @@ def _write_missing(path: Path, seeds: np.ndarray, settings: dict, processes: int
         raise UserError(f"{record} holds a dataset with {wrong}; write into another folder.")
     record.write_text(json.dumps(settings, indent=1) + "\n", encoding="utf-8")
     jobs = _missing(path, seeds, settings)
-    # Threads lose on this work; one-thread processes scale. Workers read these when JAX starts.
+    with one_thread_workers(min(processes, len(jobs))) as workers:
+        for done in concurrent.futures.as_completed(workers.submit(_write_shard, j) for j in jobs):
+            name, seconds = done.result()
+            print(f"{name}: {seconds:.0f} s", flush=True)
+
+
+@contextlib.contextmanager
+def one_thread_workers(processes: int) -> Iterator[concurrent.futures.ProcessPoolExecutor]:
+    """Processes of one thread each, on the CPU. Threads lose on rendering and decoding, such processes scale."""
+    # Workers read these when JAX starts.
     old = {name: os.environ.get(name) for name in _WORKER_ENVIRONMENT}
     flags = f"{os.environ.get('XLA_FLAGS', '')} {_WORKER_ENVIRONMENT['XLA_FLAGS']}".strip()
     os.environ.update(_WORKER_ENVIRONMENT | {"XLA_FLAGS": flags})  # the caller's flags stay
     try:
         # An executor and not a multiprocessing.Pool: a worker that dies raises, it never hangs.
         with concurrent.futures.ProcessPoolExecutor(
-            max(1, min(processes, len(jobs))), mp_context=multiprocessing.get_context("spawn")
+            max(1, processes), mp_context=multiprocessing.get_context("spawn")
         ) as workers:
-            for done in concurrent.futures.as_completed(
-                workers.submit(_write_shard, j) for j in jobs
-            ):
-                name, seconds = done.result()
-                print(f"{name}: {seconds:.0f} s", flush=True)
+            yield workers
     finally:
         for name, value in old.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
@@ -250,7 +262,7 @@ def read_dataset(path: str | Path) -> Dataset:
     if not stems:
         raise UserError(
             f"{path} holds no finished shard_*.npz; write one with "
-            f"`python -m roge_jax.procedural dataset --out {path}`."
+            f"`python -m roge_jax.data.pack SCENES --out {path}` or `python -m roge_jax.procedural dataset --out {path}`."
         )
     cameras: list[dict[str, np.ndarray]] = []
     pixels: dict[str, list[np.ndarray]] = {"rgb": [], "depth": []}
@@ -258,6 +270,8 @@ def read_dataset(path: str | Path) -> Dataset:
         try:
             with stem.with_suffix(".npz").open("rb") as file, np.load(file) as stored:
                 cameras.append({name: stored[name] for name in ("seeds", "K", "c2w")})
+                whole = np.full(len(cameras[-1]["K"]), cameras[-1]["K"].shape[1])
+                cameras[-1]["lengths"] = stored.get("lengths", whole)
             for name, maps in pixels.items():
                 array = stem.with_suffix(f".{name}.npy")
                 if name == "rgb" or array.exists():

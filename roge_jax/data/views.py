@@ -12,6 +12,8 @@ from ..errors import UserError
 from ..geometry.cameras import Cameras, camera_vector, normalise
 from .faults import captured
 
+ATTEMPTS = 50  # at one sample
+
 
 @dataclass(frozen=True)
 class ViewConfig:
@@ -147,27 +149,48 @@ def draw_batch(
     rng = np.random.default_rng([seed, index])
     weights = np.asarray(cfg.context_weights) / sum(cfg.context_weights)
     m = int(rng.choice(cfg.contexts, p=weights))
-    samples = []
-    for j in range(batch) if rows is None else rows:
-        rng = np.random.default_rng(
-            [seed, index, 2 + int(j)]
-        )  # [.., 0] would repeat the stream of M
-        number = int(rng.integers(len(pool)))
-        sequence = pool[number]
-        contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
-        views = np.concatenate([contexts, targets])
-        rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
-        c2w = np.asarray(sequence["c2w"][views], np.float64)
-        depth = _depth_of(sequence, views, cfg.size, number) if cfg.depth else None
-        if cfg.augment:
-            rgb, K, c2w, depth = alter(rng, rgb, K, c2w, depth)
-        if cfg.faults and rng.random() < cfg.faults:
-            photos, cameras = captured(rgb[:m].astype(np.float32), Cameras(K[:m], c2w[:m]), rng)
-            rgb, K = np.concatenate([photos, rgb[m:]]), np.concatenate([cameras.K, K[m:]])
-            c2w = np.concatenate([cameras.c2w, c2w[m:]])
-        try:
-            samples.append(make_sample(rgb, K, c2w, m, scale_rule=scale_rule, depth=depth))
-        except UserError as error:
-            chosen = ", ".join(str(view) for view in views)
-            raise UserError(f"Sequence {number} of the data, frames {chosen}: {error}") from error
+    samples = [
+        _usable(pool, [seed, index, 2 + int(j)], m, cfg, scale_rule)  # [.., 0] would repeat M's
+        for j in (range(batch) if rows is None else rows)
+    ]
     return {name: np.stack([s[name] for s in samples]) for name in samples[0]}
+
+
+def _usable(pool, entropy: list[int], m: int, cfg: ViewConfig, scale_rule: str) -> dict:
+    """The sample of these random bits. Where the pool counts what cannot be used (`source.Mixture`), the next that can."""
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng(entropy + [attempt] * bool(attempt))
+        draw = getattr(pool, "draw", None)
+        number = draw(rng) if draw else int(rng.integers(len(pool)))
+        try:
+            return _sample(pool, number, rng, m, cfg, scale_rule)
+        except (ValueError, OSError) as error:  # a UserError is a ValueError
+            if draw is None:
+                raise
+            pool.pass_over(number, error)
+            last = error
+    raise UserError(
+        f"{ATTEMPTS} sequences in a row cannot be used, the last because: {last}"
+    ) from last
+
+
+def _sample(pool, number: int, rng, m: int, cfg: ViewConfig, scale_rule: str) -> dict:
+    sequence = pool[number]
+    contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
+    views = np.concatenate([contexts, targets])
+    if not all(np.isfinite(sequence[name][views]).all() for name in ("K", "c2w")):
+        raise UserError(f"Sequence {number} of the data has a camera that is not finite.")
+    rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
+    c2w = np.asarray(sequence["c2w"][views], np.float64)
+    depth = _depth_of(sequence, views, cfg.size, number) if cfg.depth else None
+    if cfg.augment:
+        rgb, K, c2w, depth = alter(rng, rgb, K, c2w, depth)
+    if cfg.faults and rng.random() < cfg.faults:
+        photos, cameras = captured(rgb[:m].astype(np.float32), Cameras(K[:m], c2w[:m]), rng)
+        rgb, K = np.concatenate([photos, rgb[m:]]), np.concatenate([cameras.K, K[m:]])
+        c2w = np.concatenate([cameras.c2w, c2w[m:]])
+    try:
+        return make_sample(rgb, K, c2w, m, scale_rule=scale_rule, depth=depth)
+    except UserError as error:
+        chosen = ", ".join(str(view) for view in views)
+        raise UserError(f"Sequence {number} of the data, frames {chosen}: {error}") from error

@@ -252,7 +252,7 @@ def _binary(file: Path) -> str:
     with file.open("rb") as stream:
         start = stream.read(4096)
     if ending in (".torch", ".pt", ".pth", ".ckpt"):
-        return "is a PyTorch file (pixelSplat's chunks are such), which is not read: unpack it into frames and a RealEstate10K .txt."
+        return "is a PyTorch file: `python -m roge_jax.data.pack` makes training data of pixelSplat's chunks, and a scene needs frames and a RealEstate10K .txt."
     if start.startswith(b"PK\x03\x04") or ending in (".zip", ".tar", ".gz", ".tgz", ".7z", ".rar"):
         return "is an archive: unpack it and give the folder."
     if b"\0" in start or start.startswith((b"\xff\xd8", b"\x89PNG", b"II*", b"MM")):

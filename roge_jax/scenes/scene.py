@@ -284,13 +284,7 @@ def prepare(
     if not isinstance(scene.images, Photos):
         for i in ids:
             _check_pixels(scene.images[i], f"{scene.source}, view {i} ({scene.names[i]})")
-    aspects = [scene.sizes[i][1] / scene.sizes[i][0] for i in ids]
-    if max(aspects) > 2 * min(aspects):
-        wide, tall = ids[int(np.argmax(aspects))], ids[int(np.argmin(aspects))]
-        raise UserError(
-            f"{scene.source}: photos {scene.names[wide]} and {scene.names[tall]} differ by more "
-            "than a factor of two in aspect ratio: crop them alike, or choose other views."
-        )
+    check_aspects(scene, ids)
     images, Ks = [], []
     for i in ids:
         image, K = crop_resize(scene.images[i], scene.cameras.K[i], height, width)
@@ -305,6 +299,18 @@ def prepare(
             warnings.warn(message, CameraWarning, stacklevel=2)
             pictures, cameras = pictures[kept], cameras[kept]
     return pictures, cameras
+
+
+def check_aspects(scene: Scene, ids: Sequence[int]) -> None:
+    """Raise UserError if photos differ so much in shape that one crop would show what the other lacks."""
+    sizes = scene.sizes
+    aspects = [sizes[i][1] / sizes[i][0] for i in ids]
+    if max(aspects) > 2 * min(aspects):
+        wide, tall = ids[int(np.argmax(aspects))], ids[int(np.argmin(aspects))]
+        raise UserError(
+            f"{scene.source}: photos {scene.names[wide]} and {scene.names[tall]} differ by more "
+            "than a factor of two in aspect ratio: crop them alike, or choose other views."
+        )
 
 
 def _check_pixels(image: Any, where: str) -> None:

@@ -8,11 +8,12 @@ A skipped step keeps its place in the order of the data but does not count for t
 on applied updates. After a resume the divergence detector starts afresh; everything else continues.
 """
 
+import collections
+import concurrent.futures
 import contextlib
+import itertools
 import json
 import os
-import queue
-import threading
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -49,6 +50,7 @@ class LoopConfig:
         0.01  # stop when more than this share of the steps was skipped (after 100 steps) ...
     )
     max_streak: int = 10  # ... or this many in a row
+    loaders: int = 1  # threads that draw batches
     patience: int = 200  # stop when the loss stays beyond best + 6 MAD for this many steps
 
 
@@ -132,39 +134,24 @@ class DivergenceDetector:
 
 
 def prefetched(
-    batches: Callable[[int], dict], first: int, last: int, depth: int = 2
+    batches: Callable[[int], dict], first: int, last: int, depth: int = 2, loaders: int = 1
 ) -> Generator[dict, None, None]:
-    """batches(first), .., batches(last - 1), prepared by a thread while the device works."""
-    ready: queue.Queue = queue.Queue(maxsize=depth)
-    stop = threading.Event()
+    """batches(first), .., batches(last - 1) in order, prepared by threads while the device works.
 
-    def put(item) -> None:
-        while not stop.is_set():
-            try:
-                return ready.put(item, timeout=0.2)
-            except queue.Full:
-                continue
-
-    def work() -> None:
-        try:
-            for i in range(first, last):
-                if stop.is_set():
-                    return
-                put(batches(i))
-        except BaseException as error:
-            put(error)
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
+    No more than `depth` and one a thread are ready or in work. An error comes through in its turn.
+    """
+    waiting: collections.deque[concurrent.futures.Future] = collections.deque()
+    pool = concurrent.futures.ThreadPoolExecutor(loaders, thread_name_prefix="loader")
     try:
-        for _ in range(first, last):
-            item = ready.get()
-            if isinstance(item, BaseException):
-                raise item
-            yield item
+        following = iter(range(first, last))
+        for i in itertools.islice(following, depth + loaders):
+            waiting.append(pool.submit(batches, i))
+        while waiting:
+            found = waiting.popleft().result()
+            waiting.extend(pool.submit(batches, i) for i in itertools.islice(following, 1))
+            yield found
     finally:
-        stop.set()
-        thread.join()
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def train(
@@ -214,7 +201,7 @@ def train(
     step = jax.jit(make_step(objective, optimiser, optim), donate_argnums=0, out_shardings=where)
     key = jax.random.key(loop.seed)
     first, detector = int(state["step"]), DivergenceDetector(loop.patience)
-    started, logged, terms = time.perf_counter(), first, []
+    started, logged, waited, terms = time.perf_counter(), first, 0.0, []
     bar = tqdm(
         total=loop.steps,
         initial=first,
@@ -223,7 +210,7 @@ def train(
         mininterval=1.0,
         disable=not is_main(),
     )
-    source = contextlib.closing(prefetched(batches, first, loop.steps))
+    source = contextlib.closing(prefetched(batches, first, loop.steps, loaders=loop.loaders))
 
     log_file = log_path if is_main() else Path(os.devnull)
     with (
@@ -236,7 +223,10 @@ def train(
         if evaluate and evaluate_every and first == 0:
             before = evaluate(state["ema"] if "ema" in state else state["params"])
             log.write(json.dumps({"step": 0} | _finite(before)) + "\n")
-        for i, views in enumerate(ready, first):
+        for i in range(first, loop.steps):
+            asked = time.perf_counter()
+            views = next(ready)
+            waited += time.perf_counter() - asked
             if mesh is not None:
                 views = global_batch(views, mesh, batch or len(next(iter(views.values()))))
             state, metrics = step(state, frozen, views, jax.random.fold_in(key, i))
@@ -260,8 +250,9 @@ def train(
                 extra = extra | diagnose(state["params"], frozen, views, jax.random.fold_in(key, i))
             # A line ends at every checkpoint, so that the log of a resumed run has the same lines.
             if extra or reason or due(loop.log_every) or due(loop.save_every):
-                rate = (done - logged) / max(time.perf_counter() - started, 1e-9)
-                row = _mean_row(terms) | {"step": done, "steps_per_s": rate} | _finite(extra)
+                spent = max(time.perf_counter() - started, 1e-9)
+                speed = {"steps_per_s": (done - logged) / spent, "waiting": waited / spent}
+                row = _mean_row(terms) | {"step": done} | speed | _finite(extra)
                 log.write(json.dumps(row) + "\n")
                 log.flush()
                 if writer is not None:
@@ -270,7 +261,7 @@ def train(
                             writer.add_scalar(f"{name}/{term}", value, done)
                 if row["loss"] is not None:
                     bar.set_postfix(loss=f"{row['loss']:.4g}", refresh=False)
-                terms, logged, started = [], done, time.perf_counter()
+                terms, logged, waited, started = [], done, 0.0, time.perf_counter()
             if reason is not None:
                 last = checkpoints.latest()
                 good = (

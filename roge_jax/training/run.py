@@ -15,6 +15,7 @@ from ..core.lora import attach
 from ..core.params import Tree, count, flatten, unflatten
 from ..core.params import init as init_specs
 from ..cost import kept_as
+from ..data.source import MOST_BAD
 from . import loop, stages, start
 from .diagnose import joint_diagnose
 from .held_out import held_out
@@ -26,7 +27,9 @@ class Options:
     """What all stages of a run have in common; the names are those of the command line (docs/reference/programs.md)."""
 
     out: Path
-    data: Path | None = None  # a dataset, or rendered as we go
+    data: Any = None  # a dataset or a list of them (`data.source.Given`); None: rendered as we go
+    most_bad: int = MOST_BAD  # sequences of the data that may be unusable
+    loaders: int = 1  # threads that draw batches
     seed: int = 0
     resume: bool = False
     skip_done: bool = False  # with `resume`: a stage whose model is there is not run again
@@ -62,7 +65,8 @@ def run_stage(
     dtype = start.kept_dtype(options.frozen_dtype)
     if _trained_before(out, stage, params, config, options, base=base, dtype=dtype):
         return checkpoint.open_model(out / "model")
-    source = start.open_data(options.data, stage, config)
+    listed = out / "passed_over.jsonl"
+    source = start.open_data(options.data, stage, config, most=options.most_bad, file=listed)
     if stage.about_preview and config.fusion.preview and config.fusion.preview_std is None:
         params, config = stages.measure_preview(params, source, config, options.seed)
     parts = _divided(params, stage, config, options.seed, mesh, dtype)
@@ -90,7 +94,7 @@ def run_stage(
                 lora=lora,
             )
         if stage.lora:
-            data = str(options.data or "procedural scenes")
+            data = start.named(options.data)
             provenance |= {"data": data, "base_weights": origin}
             checkpoint.save_adapter(out / "adapter", learned, config, provenance)
         change = loop.held_out_change(out / "log.jsonl")  # which only the main process writes
@@ -188,6 +192,7 @@ def _fit(
                 seed=options.seed,
                 log_every=options.log_every,
                 save_every=options.save_every,
+                loaders=options.loaders,
             ),
             out=out,
             resume=options.resume,

@@ -15,7 +15,7 @@ from ..config import RoGeConfig
 from ..core import distributed, products, target
 from ..core.params import Tree, loaded
 from ..cost import kept_as
-from ..data.source import open_source
+from ..data.source import MOST_BAD, as_given, open_mixture
 from ..errors import UserError
 from ..files.folders import fingerprint_files, keep_settings
 from . import encoded, stages
@@ -24,12 +24,20 @@ from .stages import Stage, stage_config
 PUT_BACK = "put it back and continue with --resume, nothing that was trained is lost"
 
 
-def open_data(pool: Path | None, stage: Stage, config: RoGeConfig):
-    """The sequences of a stage. Raises: UserError if the dataset does not have its size or frames."""
+def open_data(
+    data, stage: Stage, config: RoGeConfig, *, most: int = MOST_BAD, file: Path | None = None
+):
+    """The sequences of a stage: of a dataset, of several with weights, or procedural ones (None).
+
+    Up to `most` that cannot be used are passed over and listed in `file`. Raises: UserError if a dataset does not have
+    the stage's size or frames.
+    """
     working = stage_config(config, stage)
-    window = working.frames if stage.views.ordered or stage.objective == "vae" else 1
+    video = stage.views.ordered or stage.objective == "vae"
+    window = working.frames if video else max(stage.views.contexts) + 1
+    size = working.height, working.width
     try:
-        return open_source(pool, working.height, working.width, window, stage.views.depth)
+        return open_mixture(as_given(data), *size, window, stage.views.depth, most=most, file=file)
     except UserError as error:
         raise UserError(f"Stage {stage.name}: {error}") from None
 
@@ -43,7 +51,7 @@ def hold_settings(
     seed: int,
     frozen_dtype: str,
     start: str,
-    pool: Path | None,
+    pool: Any,
     begun: bool,
     resume: bool,
 ) -> list[str]:
@@ -66,7 +74,7 @@ def hold_settings(
     }
     if pool is not None:
         settings["data contents"] = pool_fingerprint(pool)
-    notes = {"start": start, "data": str(pool or "procedural scenes"), "steps": stage.steps}
+    notes = {"start": start, "data": named(pool), "steps": stage.steps}
     before = keep_settings(out, settings, begun=begun, resume=resume, notes=notes)
     told = []
     if before.get("steps", stage.steps) != stage.steps:
@@ -113,9 +121,7 @@ def samples(
     return lambda i: clips.batch(seed, i, stage.batch), encode
 
 
-def check_processes(
-    options: Mapping[str, Any], start: str, pool: Path | None, *, version: str
-) -> None:
+def check_processes(options: Mapping[str, Any], start: str, pool: Any, *, version: str) -> None:
     """Raise UserError in every process of a run that was not started alike everywhere: options, code, model or data."""
     if jax.process_count() == 1:
         return
@@ -139,9 +145,18 @@ def check_processes(
     distributed.check_same(contents, "every process must see the same files")
 
 
-def pool_fingerprint(pool: Path) -> str:
-    """`folders.fingerprint_files` of a dataset."""
-    return fingerprint_files(pool, "shard_*.npz", "shard_*.rgb.npy")
+def pool_fingerprint(pool: Any) -> str:
+    """`folders.fingerprint_files` of a dataset, or of several with their weights."""
+    sources = as_given(pool)
+    found = [fingerprint_files(one.folder, "shard_*.npz", "shard_*.rgb.npy") for one in sources]
+    if len(found) == 1:
+        return found[0]
+    return ", ".join(f"{one}:{source.weight:g}" for one, source in zip(found, sources, strict=True))
+
+
+def named(data: Any) -> str:
+    """How a record calls the data."""
+    return ", ".join(map(str, as_given(data))) or "procedural scenes"
 
 
 def find_devices(count: int | None) -> list[jax.Device]:

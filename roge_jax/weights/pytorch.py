@@ -12,11 +12,11 @@ import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
-from ..errors import UserError
+from ..errors import UnsafeFile, UserError
 from .stored import DTYPES, Stored, check_content
 
 WRAPPERS = (
@@ -57,6 +57,19 @@ class _Storage(NamedTuple):
 
 def read_torch_header(file: Path) -> dict[str, Stored]:
     """{key: place} of a PyTorch file (`torch.save` of version 1.6 or later), without PyTorch and without trust."""
+    tensors = _find_tensors(read_torch_content(file))
+    if not tensors:
+        raise UserError(
+            f"{file} holds no tensors by name: give the weights, not the optimiser or a whole module."
+        )
+    return tensors
+
+
+def read_torch_content(file: Path) -> Any:
+    """What `torch.save` was given, of dicts, lists, numbers and texts, with `Stored` for every tensor.
+
+    Raises: UnsafeFile if the file asks for anything but that; UserError if it is damaged or no such file.
+    """
     check_content(file)
     try:
         archive = zipfile.ZipFile(file)
@@ -79,19 +92,14 @@ def read_torch_header(file: Path) -> dict[str, Stored]:
                 f"{file} was written on a big-endian machine: save it again on a usual one."
             )
         try:
-            content = _Unpickler(file, archive.read(pickles[0]), places).load()
+            with file.open("rb") as stream:
+                return _Unpickler(file, archive.read(pickles[0]), places, stream).load()
         except UserError:
             raise
         except Exception as error:  # a damaged pickle can fail in any way
             raise UserError(
                 f"{file} cannot be read ({type(error).__name__}: {error}): download it again."
             ) from None
-    tensors = _find_tensors(content)
-    if not tensors:
-        raise UserError(
-            f"{file} holds no tensors by name: give the weights, not the optimiser or a whole module."
-        )
-    return tensors
 
 
 def _find_tensors(content: Any) -> dict[str, Stored]:
@@ -106,9 +114,11 @@ def _find_tensors(content: Any) -> dict[str, Stored]:
 class _Unpickler(pickle.Unpickler):
     """Knows how tensors are put together, and nothing else. Names are looked up here, never imported."""
 
-    def __init__(self, file: Path, data: bytes, places: Mapping[str, zipfile.ZipInfo]):
+    def __init__(
+        self, file: Path, data: bytes, places: Mapping[str, zipfile.ZipInfo], stream: BinaryIO
+    ):
         super().__init__(io.BytesIO(data))
-        self.file, self.places = file, places
+        self.file, self.places, self.stream = file, places, stream
         self.opened: dict[str, _Storage] = {}
 
     def find_class(self, module: str, name: str) -> Any:
@@ -130,8 +140,8 @@ class _Unpickler(pickle.Unpickler):
                 f"{self.file} has tensors of type {kind[1] or kind[2]}, which cannot be read: save them as float32, bfloat16 or float16."
             )
         if (module, name) not in known:
-            raise UserError(
-                f"{self.file} tries to execute code: it asks for '{module}.{name}', which no weights need; "
+            raise UnsafeFile(
+                f"{self.file} tries to execute code: it asks for '{module}.{name}', which no tensors need; "
                 "do not load it anywhere, and take the file from its publisher."
             )
         return known[module, name]
@@ -158,11 +168,9 @@ class _Unpickler(pickle.Unpickler):
             raise UserError(
                 f"{self.file} is damaged: storage '{key}' is shorter than its {count} elements."
             )
-        with self.file.open(
-            "rb"
-        ) as f:  # bytes begin after the local header: the index lacks its length
-            f.seek(info.header_offset)
-            local = f.read(30)
+        # Bytes begin after the local header: the index lacks its length.
+        self.stream.seek(info.header_offset)
+        local = self.stream.read(30)
         if local[:4] != b"PK\x03\x04":
             raise UserError(
                 f"{self.file} is damaged: storage '{key}' is not where its index says; download it again."

@@ -406,9 +406,9 @@ def test_pool_round_trip_resume_and_guards(tmp_path):
 
 
 def _hold(path, ready, release):
-    from roge_jax.data.dataset import _sole_writer
+    from roge_jax.data.dataset import sole_writer
 
-    with _sole_writer(path):
+    with sole_writer(path):
         ready.set()
         release.wait(60)
 

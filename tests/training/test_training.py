@@ -86,7 +86,7 @@ def run(out, steps, *, batches=batch_of, optim=OPTIM, resume=False, **more):
     )
 
 
-def log_of(out, without=("steps_per_s",)):
+def log_of(out, without=("steps_per_s", "waiting")):
     rows = [json.loads(line) for line in (Path(out) / "log.jsonl").read_text().splitlines()]
     return [{k: v for k, v in row.items() if k not in without} for row in rows]
 
