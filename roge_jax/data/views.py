@@ -178,8 +178,12 @@ def _sample(pool, number: int, rng, m: int, cfg: ViewConfig, scale_rule: str) ->
     sequence = pool[number]
     contexts, targets = draw_views(rng, len(sequence["K"]), m, cfg)
     views = np.concatenate([contexts, targets])
-    if not all(np.isfinite(sequence[name][views]).all() for name in ("K", "c2w")):
-        raise UserError(f"Sequence {number} of the data has a camera that is not finite.")
+    finite = [np.isfinite(sequence[name][views]).all((1, 2)) for name in ("K", "c2w")]
+    if not np.all(finite):
+        bad = ", ".join(str(view) for view in np.unique(views[~np.logical_and(*finite)]))
+        raise UserError(
+            f"Sequence {number} of the data, frames {bad}: their cameras have NaN or infinite numbers: pack the scene again."
+        )
     rgb, K = average_down(sequence["rgb"][views], sequence["K"][views], cfg.size)
     c2w = np.asarray(sequence["c2w"][views], np.float64)
     depth = _depth_of(sequence, views, cfg.size, number) if cfg.depth else None

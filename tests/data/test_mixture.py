@@ -1,6 +1,7 @@
 """Several datasets with weights: the same samples for every process and after every resume, bad sequences passed over."""
 
 import json
+import re
 import time
 
 import numpy as np
@@ -81,9 +82,10 @@ def test_bad_sequences_are_listed_up_to_a_limit(tmp_path, capsys):
         mixture = open_mixture(as_given(folder), *SIZE, 3, most=1, file=file)
         for i in range(6):
             draw(mixture, i)
-    row = {"data": str(folder), "sequence": 1}
-    row["reason"] = "Sequence 1 of the data has a camera that is not finite."
-    assert [json.loads(line) for line in file.read_text().splitlines()] == [row]
+    (row,) = [json.loads(line) for line in file.read_text().splitlines()]
+    reason = row.pop("reason")
+    assert row == {"data": str(folder), "sequence": 1}
+    assert re.fullmatch(r"Sequence 1 of the data, frames [\d, ]+: their cameras .* NaN .*", reason)
     assert capsys.readouterr().err.count("passed over: ") == 1
     with pytest.raises(
         UserError, match=r"1 sequences of the data cannot be used, the last in .*a: Seq"
